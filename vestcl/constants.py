@@ -1,0 +1,24 @@
+"""Every number that kernels and Python share, with its reason. Kernels receive them as ``-D`` defines."""
+
+from typing import Final
+
+#: Points nearer than this (metres, z-depth) make no fragment: in front of it a car's own bonnet ends,
+#: behind it 1/z stays well inside float32.
+NEAR: Final = 0.1
+
+#: Side of a square tile in pixels. A point of up to TILE / 2 = 8 px radius (the adaptive radius' upper
+#: clamp) then touches at most 2 x 2 tiles, and 16 x 16 x 32 float32 accumulators fit a 48 KiB L1 cache.
+TILE: Final = 16
+
+#: Width of the kernels' channel vectors: one 512-bit register of float32, two 256-bit ones.
+VECTOR: Final = 16
+
+#: Fragments whose alpha and transmittance the CPU backward keeps at a time, per tile. At least one
+#: point's largest footprint (TILE * TILE); 4096 keeps them in L1/L2 and a street tile in one segment.
+SEGMENT: Final = 4096
+
+#: Quaternions are divided by max(|q|, QUATERNION_FLOOR) (SPEC section 1).
+QUATERNION_FLOOR: Final = 1e-8
+
+#: The tile kernels keep TILE * TILE * C accumulators in private memory; 1024 channels are 1 MiB in float32.
+MAX_CHANNELS: Final = 1024

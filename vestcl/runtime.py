@@ -1,0 +1,350 @@
+"""OpenCL devices, programs and launches. The only module that imports pyopencl, and it opens no device on import.
+
+An operator runs as one `Job`: arrays are bound, kernels enqueued, and leaving the ``with`` block waits and
+makes the results visible::
+
+    session = runtime.current()
+    with session.job() as job:
+        job.launch("unproject.cl", "unproject", {"REAL": "float"}, (count,), [np.int32(count), job.read(depth), ...])
+"""
+
+import contextlib
+import contextvars
+import functools
+import os
+import re
+import shutil
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.tools
+
+from vestcl import constants, pocl_cpu
+
+Defines = Mapping[str, str | int]
+Argument = cl.MemoryObjectHolder | np.generic
+
+
+class DeviceError(RuntimeError):
+    """No OpenCL device as asked for, or one that can't do what an operator needs. The message names the remedy."""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """What `vestcl devices` prints about one OpenCL device."""
+
+    index: str
+    """``platform:device``, a valid value of VESTCL_DEVICE."""
+    platform: str
+    name: str
+    kind: str
+    """"CPU", "GPU" or "accelerator"."""
+    compute_units: int
+    memory_gib: float
+    local_memory_kib: float
+    float64: bool
+    version: str
+    driver: str
+
+
+@dataclass(frozen=True)
+class KernelTime:
+    """One kernel launch, from its OpenCL event: name, and start and end in nanoseconds of the device's clock."""
+
+    name: str
+    start_ns: int
+    end_ns: int
+
+
+# ---------------------------------------------------------------- devices
+
+
+@functools.cache
+def _all_devices() -> tuple[tuple[DeviceInfo, cl.Device], ...]:
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError as error:  # the loader's way to say that there are none
+        if "PLATFORM_NOT_FOUND" not in str(error):
+            raise
+        platforms = []
+    found = []
+    for p, platform in enumerate(platforms):
+        try:
+            devices = platform.get_devices()
+        except cl.Error:  # a platform without devices (rusticl without RUSTICL_ENABLE) is no reason to fail
+            continue
+        for d, device in enumerate(devices):
+            if pocl_cpu.is_unnamed(platform.version, device.version):
+                pocl_cpu.name_cpu(device.int_ptr)
+            found.append((_describe(f"{p}:{d}", platform, device), device))
+    return tuple(found)
+
+
+def _describe(index: str, platform: cl.Platform, device: cl.Device) -> DeviceInfo:
+    kinds = {cl.device_type.CPU: "CPU", cl.device_type.GPU: "GPU"}
+    return DeviceInfo(
+        index=index,
+        platform=platform.name.strip(),
+        name=device.name.strip(),
+        kind=next((kind for flag, kind in kinds.items() if device.type & flag), "accelerator"),
+        compute_units=device.max_compute_units,
+        memory_gib=device.global_mem_size / 2**30,
+        local_memory_kib=device.local_mem_size / 2**10,
+        float64="cl_khr_fp64" in device.extensions,
+        version=device.version.strip(),
+        driver=f"{platform.version.strip()} / {device.driver_version.strip()}",
+    )
+
+
+def devices() -> list[DeviceInfo]:
+    """Every device of every OpenCL platform, in the loader's order."""
+    return [info for info, _ in _all_devices()]
+
+
+def select(selector: str | None = None) -> DeviceInfo:
+    """The device that ``selector`` means.
+
+    Args:
+        selector: ``"0:1"`` (platform:device), or a part of the platform's, device's or driver's name in any case, such as
+            ``"pocl"``, ``"intel"``, ``"nvidia"``. None: the environment variable VESTCL_DEVICE, and without
+            it the PoCL that pip installed, else any CPU, else any device.
+
+    Raises:
+        DeviceError: no device fits; the message lists those that there are.
+    """
+    selector = selector or os.environ.get("VESTCL_DEVICE")
+    infos = devices()
+    if not infos:
+        raise DeviceError("no OpenCL device found; `pip install 'pyopencl[pocl]'` brings one for the CPU")
+    if selector is None:
+        return min(infos, key=lambda info: (info.kind != "CPU", "PoCL" not in info.version))
+    if re.fullmatch(r"\d+:\d+", selector):
+        chosen = [info for info in infos if info.index == selector]
+    else:
+        text = selector.lower()
+        chosen = [i for i in infos if text in f"{i.platform} {i.name} {i.version} {i.driver}".lower()]
+    if not chosen:
+        known = "; ".join(f"{info.index} {info.platform} / {info.name}" for info in infos)
+        raise DeviceError(f"VESTCL_DEVICE or selector {selector!r} fits none of the OpenCL devices: {known}")
+    return chosen[0]
+
+
+_selected: contextvars.ContextVar["Session | None"] = contextvars.ContextVar("vestcl_device", default=None)
+
+
+class use:  # noqa: N801 - reads as a verb, like contextlib.suppress
+    """Run vestcl's operators on another device: from here on, or inside a ``with`` block.
+
+    Args:
+        selector: as in `select`.
+        mapping: how work is laid out, "tile" (a work-item a tile, for CPUs) or "pixel" (a work-item a pixel, tile
+            lists in local memory, for GPUs); None takes what suits the device's type.
+
+    >>> vestcl.use("pocl")  # doctest: +SKIP
+    >>> with vestcl.use("nvidia"):  # doctest: +SKIP
+    ...     image, coverage = vestcl.splat(...)
+    """
+
+    def __init__(self, selector: str | None = None, mapping: str | None = None) -> None:
+        if mapping not in (None, "tile", "pixel"):
+            raise ValueError(f"`mapping` must be 'tile', 'pixel' or None, got {mapping!r}")
+        info = select(selector)
+        self._previous = _selected.set(open_session(info, mapping or ("tile" if info.kind == "CPU" else "pixel")))
+
+    def __enter__(self) -> "Session":
+        return current()
+
+    def __exit__(self, *_: object) -> None:
+        _selected.reset(self._previous)
+
+
+def current() -> "Session":
+    """The session that operators run on now; opens the default device on first use."""
+    session = _selected.get()
+    if session is None:
+        info = select()
+        session = open_session(info, "tile" if info.kind == "CPU" else "pixel")
+    return session
+
+
+@functools.cache
+def open_session(info: DeviceInfo, mapping: str) -> "Session":
+    device = next(device for known, device in _all_devices() if known == info)
+    if "PoCL" in info.version and shutil.which("ld") is None:
+        raise DeviceError("PoCL calls the linker `ld`, which is not on PATH, and would abort: apt install binutils")
+    return Session(info, mapping, device)
+
+
+# ---------------------------------------------------------------- programs
+
+
+@functools.cache
+def kernel_folder() -> Path:
+    """Where the .cl files are: vestcl/kernels in a wheel, kernels/ beside the package in a checkout or editable install."""
+    package = Path(__file__).resolve().parent
+    for folder in (package / "kernels", package.parent / "kernels"):
+        if (folder / "common.h").is_file():
+            return folder
+    raise DeviceError(f"vestcl's OpenCL kernels are missing beside {package}: install the package again")
+
+
+@functools.cache
+def source(name: str) -> str:
+    """The text of kernel file ``name`` with its ``#include "..."`` lines inlined, and #line so that errors point home."""
+    text = (kernel_folder() / name).read_text()
+    parts = [f'#line 1 "{name}"']
+    for number, line in enumerate(text.splitlines(), start=1):
+        included = re.fullmatch(r'\s*#include "(.+)"\s*', line)
+        parts.append(f'{source(included[1])}\n#line {number + 1} "{name}"' if included else line)
+    return "\n".join(parts)
+
+
+# ---------------------------------------------------------------- sessions and jobs
+
+
+class Session:
+    """An open device: its context, queue, compiled programs and scratch memory. Use it from any thread."""
+
+    def __init__(self, info: DeviceInfo, mapping: str, device: cl.Device) -> None:
+        self.info = info
+        self.mapping = mapping
+        self.shares_host_memory = info.kind == "CPU"
+        self._context = cl.Context([device])
+        self._device = device
+        self._queue = cl.CommandQueue(self._context)
+        self._kernels: dict[tuple[str, tuple[tuple[str, str | int], ...]], dict[str, cl.Kernel]] = {}
+        self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self._queue))
+        self._lock = threading.RLock()
+        self._profile: list[tuple[str, cl.Event]] | None = None
+
+    def __repr__(self) -> str:
+        return f"Session({self.info.index} {self.info.platform} / {self.info.name}, mapping={self.mapping!r})"
+
+    def job(self) -> "Job":
+        """A `Job` on this device; ``with session.job() as job`` holds the device until it is done."""
+        return Job(self)
+
+    def kernel(self, file: str, name: str, defines: Defines) -> cl.Kernel:
+        """Kernel ``name`` of ``file`` built with ``defines``; each program is built once and kept."""
+        key = (file, tuple(sorted(defines.items())))
+        if key not in self._kernels:
+            program = self._build(file, defines)
+            self._kernels[key] = {kernel.function_name: kernel for kernel in program.all_kernels()}
+        return self._kernels[key][name]
+
+    def _build(self, file: str, defines: Defines) -> cl.Program:
+        if defines.get("REAL") == "double" and not self.info.float64:
+            raise DeviceError(f"{self.info.name} has no float64; pass float32 or choose another device (`vestcl devices`)")
+        options = ["-cl-std=CL1.2", *(f"-D{key}={value}" for key, value in defines.items())]
+        # The CPU that name_cpu() gave is not in the key of PoCL's own disk cache: a comment puts it there.
+        text = f"// {pocl_cpu.host_key()}\n{source(file)}"
+        try:
+            return cl.Program(self._context, text).build(options, cache_dir=None)
+        except cl.RuntimeError as error:
+            raise DeviceError(f"{file} does not build on {self.info.name} with {' '.join(options)}:\n{error}") from None
+
+    @contextlib.contextmanager
+    def profile(self) -> Iterator[list[KernelTime]]:
+        """Collect every kernel's start and end inside the ``with`` block; the list is filled when it ends."""
+        times: list[KernelTime] = []
+        with self._lock:
+            plain, self._queue = self._queue, cl.CommandQueue(
+                self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
+            )
+            self._profile = events = []
+            try:
+                yield times
+            finally:
+                self._queue.finish()
+                self._queue, self._profile = plain, None
+                times.extend(KernelTime(name, e.profile.start, e.profile.end) for name, e in events)
+
+
+class Job:
+    """Arrays and launches of one operator call. See the module's example."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self._outputs: list[tuple[cl.Buffer, np.ndarray]] = []
+
+    def __enter__(self) -> "Job":
+        self.session._lock.acquire()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if kind is None:
+                self.sync()
+            else:
+                self.session._queue.finish()
+        finally:
+            self.session._lock.release()
+
+    def read(self, array: np.ndarray) -> cl.Buffer:
+        """``array`` as kernel input; on a CPU device the kernel reads the array itself."""
+        assert array.flags.forc and array.size > 0
+        where = cl.mem_flags.USE_HOST_PTR if self.session.shares_host_memory else cl.mem_flags.COPY_HOST_PTR
+        return cl.Buffer(self.session._context, cl.mem_flags.READ_ONLY | where, hostbuf=array)
+
+    def write(self, array: np.ndarray) -> cl.Buffer:
+        """``array`` as kernel output, complete after `sync`; on a CPU device the kernel writes into it."""
+        assert array.flags.c_contiguous and array.size > 0
+        flags = cl.mem_flags.READ_WRITE
+        if self.session.shares_host_memory:
+            buffer = cl.Buffer(self.session._context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=array)
+        else:
+            buffer = cl.Buffer(self.session._context, flags, size=array.nbytes)
+        self._outputs.append((buffer, array))
+        return buffer
+
+    def scratch(self, count: int, dtype: Any) -> cl.Buffer:
+        """Uninitialised device memory from the session's pool; it goes back when the last reference does."""
+        return self.session._pool.allocate(max(1, count) * np.dtype(dtype).itemsize)
+
+    def launch(
+        self,
+        file: str,
+        name: str,
+        defines: Defines,
+        global_size: Sequence[int],
+        arguments: Sequence[Argument],
+        local_size: Sequence[int] | None = None,
+    ) -> None:
+        """Enqueue kernel ``name``; scalars come as NumPy scalars of the exact C type."""
+        kernel = self.session.kernel(file, name, defines)
+        kernel.set_args(*arguments)
+        local = tuple(local_size) if local_size else (1,) * len(global_size)
+        event = cl.enqueue_nd_range_kernel(self.session._queue, kernel, tuple(global_size), local)
+        if self.session._profile is not None:
+            self.session._profile.append((name, event))
+
+    def sync(self) -> None:
+        """Wait for everything enqueued; afterwards the arrays given to `write` hold their results."""
+        queue = self.session._queue
+        for buffer, array in self._outputs:
+            if self.session.shares_host_memory:
+                mapped, _ = cl.enqueue_map_buffer(
+                    queue, buffer, cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=False
+                )
+                mapped.base.release(queue)
+            else:
+                cl.enqueue_copy(queue, array, buffer, is_blocking=False)
+        queue.finish()
+        self._outputs.clear()
+
+
+def defines_for(dtype: np.dtype, **more: str | int) -> dict[str, str | int]:
+    """What every kernel file is built with: REAL, REAL_BITS, the constants, and ``more``."""
+    double = dtype == np.float64
+    return {
+        "REAL": "double" if double else "float",
+        "REAL_BITS": 64 if double else 32,
+        "NEAR": repr(constants.NEAR),
+        "TILE": constants.TILE,
+        **more,
+    }
