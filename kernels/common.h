@@ -15,10 +15,10 @@
 #if REAL_BITS == 64
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 #define AS_KEY as_ulong
-typedef ulong key_t_;
+typedef ulong key_bits;
 #else
 #define AS_KEY as_uint
-typedef uint key_t_;
+typedef uint key_bits;
 #endif
 
 #define JOIN_(a, b) a##b

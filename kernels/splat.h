@@ -1,4 +1,4 @@
-// Geometry that binning and compositing share. A point's fragments lie in its footprint: the pixels whose
+// Geometry and vectors that the splat kernels share. A point's fragments lie in its footprint: the pixels whose
 // centres (x + 0.5, y + 0.5) are nearer to (u, v) than r.
 //   TILE   side of a square tile, pixels
 #ifndef TILE
@@ -14,36 +14,56 @@
 typedef struct { int x0, y0, x1, y1; } box_t;
 
 // One entry of a tile list while it is sorted: the bits of z (positive, so they order as z does) and the point.
-typedef struct { key_t_ key, id; } entry_t;
+typedef struct { key_bits key, id; } entry_t;
 
-// One entry of a sorted tile list. box: the footprint inside the tile, x0 | x1 << 8 | y0 << 16 | y1 << 24.
+// One entry of a sorted tile list. box holds the footprint inside the tile, see pack_box.
 typedef struct { REAL u, v, r, r2, slope, o; int box, id; } record_t;
 
+// A footprint inside one tile, and whether it is the point's whole footprint.
+inline int pack_box(box_t box, bool whole) { return box.x0 | box.x1 << 5 | box.y0 << 10 | box.y1 << 15 | (int)whole << 20; }
+inline box_t unpack_box(int packed) {
+  const box_t box = {packed & 31, packed >> 10 & 31, packed >> 5 & 31, packed >> 15 & 31};
+  return box;
+}
+inline bool is_whole(int packed) { return packed >> 20; }
+
+// The indices of the pixels in [0, size) whose centres lie in (low, high) are [first_pixel(low), end_pixel(high)).
 inline int first_pixel(REAL low, int size) {
-  low = low - (REAL)0.5 - SLACK;
+  low -= (REAL)0.5 + SLACK;
   low = low > 0 ? low : 0;
   low = low < size ? low : size;
   const int whole = (int)low;
   return whole + (low > whole);
 }
 
-inline int last_pixel(REAL high, int size) {
-  high = high + (REAL)0.5 + SLACK;
+inline int end_pixel(REAL high, int size) {
+  high += (REAL)0.5 + SLACK;
   high = high > 0 ? high : 0;
   high = high < size ? high : size;
   return (int)high;
 }
 
 inline box_t footprint(REAL u, REAL v, REAL r, int height, int width) {
-  box_t box;
-  box.x0 = first_pixel(u - r, width);
-  box.x1 = last_pixel(u + r, width);
-  box.y0 = first_pixel(v - r, height);
-  box.y1 = last_pixel(v + r, height);
+  const box_t box = {
+      first_pixel(u - r, width), first_pixel(v - r, height), end_pixel(u + r, width), end_pixel(v + r, height)};
   return box;
 }
 
-// Whether a point can make fragments: all its numbers finite, not behind the near plane, some radius.
+inline int area_of(box_t box) { return (box.x1 - box.x0) * (box.y1 - box.y0); }
+
+// Quads (2 x 2 pixels) that cover a footprint, from its first pixel on.
+inline int quads_in(box_t box) { return (box.x1 - box.x0 + 1) / 2 * ((box.y1 - box.y0 + 1) / 2); }
+
+// Whether a point can make fragments: all its numbers finite, not in front of the near plane, some radius.
 inline bool drawable(REAL u, REAL v, REAL z, REAL r, REAL o) {
   return (u * 0 + v * 0 + z * 0 + r * 0 + o * 0 == 0) & (z >= (REAL)NEAR) & (r > 0);
 }
+
+// Where a point's fragments are, as a number: its first tile, and how many rows and columns of tiles it has more.
+// -1: nowhere. Three more or above: count them again from the footprint.
+#define MORE_BITS 2
+#define MANY ((1 << MORE_BITS) - 1)
+inline int pack_place(int tile, int more_rows, int more_columns) {
+  return tile << 2 * MORE_BITS | min(more_rows, MANY) << MORE_BITS | min(more_columns, MANY);
+}
+inline bool is_in_one_tile(int place) { return place >= 0 && (place & ((1 << 2 * MORE_BITS) - 1)) == 0; }

@@ -2,11 +2,8 @@
 #include "common.h"
 #include "splat.h"
 
-#define SPAN_BITS 2
-#define SPAN_MASK ((1 << SPAN_BITS) - 1)
-#define GROUP 128
+#define STRIP 128
 
-// tile << 2 * SPAN_BITS | rows - 1 << SPAN_BITS | columns - 1, or -1
 kernel void count_tiles(
     const int height, const int width, const int tiles_y, const int tiles_x,
     global const int* restrict cloud_starts,  // [B + 1]
@@ -26,9 +23,9 @@ kernel void count_tiles(
   global int* mine = counts + ((size_t)b * chunks + c) * tiles;
   for (int t = 0; t < tiles; t++) mine[t] = 0;
   int span = 1;
-  for (int group = begin; group < end; group += GROUP) {
-    const int stop = min(group + GROUP, end);
-    for (int i = group; i < stop; i++) {
+  for (int strip = begin; strip < end; strip += STRIP) {
+    const int stop = min(strip + STRIP, end);
+    for (int i = strip; i < stop; i++) {
       const REAL u = points_uv[2 * (size_t)i], v = points_uv[2 * (size_t)i + 1];
       const box_t box = footprint(u, v, radii[i], height, width);
       const bool some = drawable(u, v, z[i], radii[i], opacities[i]) & (box.x0 < box.x1) & (box.y0 < box.y1);
@@ -36,16 +33,15 @@ kernel void count_tiles(
       const int columns = (box.x1 - 1) / TILE - tx, rows = (box.y1 - 1) / TILE - ty;
       const int s = some ? max(columns, rows) : 0;
       span = max(span, s + 1);
-      const int place = (ty * tiles_x + tx) << 2 * SPAN_BITS | min(rows, SPAN_MASK) << SPAN_BITS | min(columns, SPAN_MASK);
-      places[i] = some ? place : -1;
+      places[i] = some ? pack_place(ty * tiles_x + tx, rows, columns) : -1;
     }
-    for (int i = group; i < stop; i++) {
+    for (int i = strip; i < stop; i++) {
       const int place = places[i];
       if (place < 0) continue;
-      int columns = place & SPAN_MASK, rows = place >> SPAN_BITS & SPAN_MASK;
-      const int first = place >> 2 * SPAN_BITS;
+      int columns = place & MANY, rows = place >> MORE_BITS & MANY;
+      const int first = place >> 2 * MORE_BITS;
       if (!(columns | rows)) { mine[first]++; continue; }
-      if (columns == SPAN_MASK || rows == SPAN_MASK) {
+      if (columns == MANY || rows == MANY) {
         const box_t box = footprint(points_uv[2 * (size_t)i], points_uv[2 * (size_t)i + 1], radii[i], height, width);
         columns = (box.x1 - 1) / TILE - box.x0 / TILE;
         rows = (box.y1 - 1) / TILE - box.y0 / TILE;
@@ -96,11 +92,11 @@ kernel void fill_tiles(
   for (int i = begin; i < end; i++) {
     const int place = places[i];
     if (place < 0) continue;
-    int columns = place & SPAN_MASK, rows = place >> SPAN_BITS & SPAN_MASK;
-    const int first = place >> 2 * SPAN_BITS;
+    int columns = place & MANY, rows = place >> MORE_BITS & MANY;
+    const int first = place >> 2 * MORE_BITS;
     const entry_t entry = {AS_KEY(z[i]), i};
     if (!(columns | rows)) { entries[mine[first]++] = entry; continue; }
-    if (columns == SPAN_MASK || rows == SPAN_MASK) {
+    if (columns == MANY || rows == MANY) {
       const box_t box = footprint(points_uv[2 * (size_t)i], points_uv[2 * (size_t)i + 1], radii[i], height, width);
       columns = (box.x1 - 1) / TILE - box.x0 / TILE;
       rows = (box.y1 - 1) / TILE - box.y0 / TILE;
@@ -119,7 +115,7 @@ inline void sort_two_digits(global entry_t* a, global entry_t* b, int n, int low
   int cursor0[DIGITS], cursor1[DIGITS];
   for (int d = 0; d < DIGITS; d++) cursor0[d] = cursor1[d] = 0;
   for (int i = 0; i < n; i++) {
-    const key_t_ key = a[i].key;
+    const key_bits key = a[i].key;
     cursor0[DIGIT(key, low)]++;
     cursor1[DIGIT(key, low + DIGIT_BITS)]++;
   }
@@ -135,6 +131,24 @@ inline void sort_two_digits(global entry_t* a, global entry_t* b, int n, int low
   for (int i = 0; i < n; i++) { const entry_t e = b[i]; a[cursor1[DIGIT(e.key, low + DIGIT_BITS)]++] = e; }
 }
 
+// What compositing needs of point id in the tile at (top, left).
+inline record_t record_of(
+    size_t id, int top, int left, int height, int width, global const REAL* points_uv, global const REAL* radii,
+    global const REAL* opacities) {
+  record_t record;
+  record.u = points_uv[2 * id];
+  record.v = points_uv[2 * id + 1];
+  record.r = radii[id];
+  record.o = opacities[id];
+  record.r2 = record.r * record.r;
+  record.slope = record.o / record.r2;
+  record.id = id;
+  const box_t box = footprint(record.u, record.v, record.r, height, width);
+  const box_t inside = {max(box.x0 - left, 0), max(box.y0 - top, 0), min(box.x1 - left, TILE), min(box.y1 - top, TILE)};
+  record.box = pack_box(inside, area_of(inside) == area_of(box));
+  return record;
+}
+
 kernel void sort_tiles(
     const int height, const int width, const int tiles_y, const int tiles_x,
     global const int* restrict tile_starts,   // [B * tiles + 1]
@@ -142,14 +156,16 @@ kernel void sort_tiles(
     global const REAL* restrict radii,        // [P]
     global const REAL* restrict opacities,    // [P]
     global entry_t* restrict entries, global entry_t* restrict room,
-    global record_t* restrict records)        // [E] out
+    global record_t* restrict records,        // [E] out
+    global long* restrict tile_slots)         // [B * tiles] out
 {
   const int t = get_global_id(0);
   const int begin = tile_starts[t], n = tile_starts[t + 1] - begin;
+  tile_slots[t] = 0;
   if (n == 0) return;
   global entry_t* a = entries + begin;
-  key_t_ differ = 0;
-  const key_t_ first = a[0].key;
+  key_bits differ = 0;
+  const key_bits first = a[0].key;
   for (int i = 1; i < n; i++) differ |= a[i].key ^ first;
   if (differ) {
     const int high = REAL_BITS - (int)clz(differ);
@@ -168,20 +184,78 @@ kernel void sort_tiles(
   }
   const int tiles = tiles_x * tiles_y;
   const int top = t % tiles / tiles_x * TILE, left = t % tiles_x * TILE;
-  const int rows = min(TILE, height - top), columns = min(TILE, width - left);
+  long slots = 0;
   for (int i = 0; i < n; i++) {
-    const size_t id = a[i].id;
-    record_t out;
-    out.u = points_uv[2 * id];
-    out.v = points_uv[2 * id + 1];
-    out.r = radii[id];
-    out.o = opacities[id];
-    out.r2 = out.r * out.r;
-    out.slope = out.o / out.r2;
-    out.id = id;
-    const int x0 = first_pixel(out.u - out.r - left, columns), x1 = last_pixel(out.u + out.r - left, columns);
-    const int y0 = first_pixel(out.v - out.r - top, rows), y1 = last_pixel(out.v + out.r - top, rows);
-    out.box = x0 | x1 << 8 | y0 << 16 | y1 << 24;
-    records[begin + i] = out;
+    const record_t record = record_of(a[i].id, top, left, height, width, points_uv, radii, opacities);
+    records[begin + i] = record;
+    slots += 4 * quads_in(unpack_box(record.box));
   }
+  tile_slots[t] = slots;
 }
+
+#ifdef TOGETHER
+#define GROUP (TILE * TILE)
+
+// Entries of a[0, n), sorted by key, that come before an entry of this key: smaller ones, and equal ones if asked for.
+inline int rank_in(global const entry_t* a, int n, key_bits key, bool equal_too) {
+  int low = 0, high = n;
+  while (low < high) {
+    const int middle = (low + high) / 2;
+    if (a[middle].key < key || (equal_too && a[middle].key == key)) low = middle + 1;
+    else high = middle;
+  }
+  return low;
+}
+
+// The same lists by one work-group a tile, for GPUs: merge sort, where each entry finds its rank in the other half.
+kernel void sort_tiles_together(
+    const int height, const int width, const int tiles_y, const int tiles_x,
+    global const int* restrict tile_starts,                    // [B * tiles + 1]
+    global const REAL* restrict points_uv,                     // [P, 2]
+    global const REAL* restrict radii,                         // [P]
+    global const REAL* restrict opacities,                     // [P]
+    global entry_t* entries, global entry_t* room,             // [E] in, overwritten; [E] room
+    global record_t* restrict records,                         // [E] out
+    global long* restrict tile_slots,                          // [B * tiles] out: pixels of all footprints
+    global long* restrict slot_starts)                         // [E] out: pixels of the footprints before, in the tile
+{
+  local long partial[GROUP + 1];
+  const int t = get_group_id(0), lane = get_local_id(0);
+  const int begin = tile_starts[t], n = tile_starts[t + 1] - begin;
+  global entry_t* a = entries + begin;
+  global entry_t* b = room + begin;
+  for (int run = 1; run < n; run *= 2) {
+    for (int i = lane; i < n; i += GROUP) {
+      const int start = i / (2 * run) * (2 * run), middle = min(start + run, n), stop = min(start + 2 * run, n);
+      const key_bits key = a[i].key;
+      const int before = i < middle ? i + rank_in(a + middle, stop - middle, key, false)
+                                    : i - run + rank_in(a + start, run, key, true);
+      b[before] = a[i];
+    }
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    global entry_t* swap = a;
+    a = b;
+    b = swap;
+  }
+  const int tiles = tiles_x * tiles_y;
+  const int top = t % tiles / tiles_x * TILE, left = t % tiles_x * TILE;
+  const int share = (n + GROUP - 1) / GROUP;
+  const int first = min(lane * share, n), stop = min(first + share, n);
+  long slots = 0;
+  for (int i = first; i < stop; i++) {
+    const record_t record = record_of(a[i].id, top, left, height, width, points_uv, radii, opacities);
+    records[begin + i] = record;
+    slot_starts[begin + i] = slots;
+    slots += area_of(unpack_box(record.box));
+  }
+  partial[lane + 1] = slots;
+  barrier(CLK_LOCAL_MEM_FENCE);
+  if (lane == 0) {
+    partial[0] = 0;
+    for (int i = 1; i <= GROUP; i++) partial[i] += partial[i - 1];
+    tile_slots[t] = partial[GROUP];
+  }
+  barrier(CLK_LOCAL_MEM_FENCE);
+  for (int i = first; i < stop; i++) slot_starts[begin + i] += partial[lane];
+}
+#endif

@@ -1,100 +1,380 @@
+// Compositing, one work-item a tile: the mapping for CPUs.
+//
+// A pixel's fragments, front to back in the order (z, index), have a_i = o_i (1 - d2_i / r_i^2) and
+//   T_0 = 1,  w_i = a_i T_i,  T_(i+1) = T_i (1 - a_i),  image = sum_i w_i f_i + T_end b,  coverage = 1 - T_end.
+// The tile's list is in that order for every pixel, so the work-item walks it once, point by point, and adds into
+// the tile's pixels, which stay in the cache. The point's row of features is read once a tile, a few points
+// ahead: the list is in depth order and the rows are anywhere.
+//
+// Backward, with g = dL/dimage and h = dL/dcoverage at a pixel, and no division by 1 - a:
+//   A_end = b.g - h,  A_i = a_i (f_i.g) + (1 - a_i) A_(i+1),  dL/da_i = T_i (f_i.g - A_(i+1)),
+//   dL/df_i = w_i g,  dL/db = sum over pixels of T_end g,
+//   da/du = 2 o dx / r^2,  da/dr = 2 o d2 / r^3,  da/do = 1 - d2 / r^2,  where dx = x + 0.5 - u.
+// T_i needs a walk forward, A_i one backward. The forward one keeps a_i and T_i of SEGMENT fragments; a longer list
+// is cut into segments, whose first T are kept (a checkpoint), and each is walked again before it is walked back.
+//
+//   TRUNCATE  1: a pixel takes no more fragments once T < min_transmittance; 0: it takes all
 #include "common.h"
 #include "splat.h"
-#ifndef CHANNELS
-#error "define CHANNELS"
+#include "channels.h"
+#include "splat_gradients.h"
+#ifndef TRUNCATE
+#error "define TRUNCATE as 0 or 1"
 #endif
-#if VEC == 1
-typedef REAL V;
-typedef REAL VU;
+
+#if TRUNCATE
+#define EXISTS(d2, r2, t) (((d2) < (r2)) & ((t) >= min_transmittance))
 #else
-typedef JOIN(REAL, VEC) V;
-typedef V __attribute__((aligned(REAL_BITS / 8))) VU;
+#define EXISTS(d2, r2, t) ((d2) < (r2))
 #endif
-#define LOAD(p) (*(global const VU*)(p))
-#define STORE(v, p) (*(global VU*)(p) = (v))
-#define BLOCKS ((CHANNELS + VEC - 1) / VEC)
-#define AT(k) ((k) == BLOCKS - 1 ? CHANNELS - VEC : (k) * VEC)
-#if VEC == 1
-inline REAL total(V v) { return v; }
-#elif VEC == 4
-inline REAL total(V v) { REAL2 a = v.lo + v.hi; return a.x + a.y; }
-#elif VEC == 8
-inline REAL total(V v) { REAL4 b = v.lo + v.hi; REAL2 a = b.lo + b.hi; return a.x + a.y; }
-#elif VEC == 16
-inline REAL total(V v) { JOIN(REAL,8) c = v.lo + v.hi; REAL4 b = c.lo + c.hi; REAL2 a = b.lo + b.hi; return a.x + a.y; }
-#endif
+
+// Points read ahead of their turn.
+#define AHEAD 8
+// Entries between two looks whether every pixel of the tile is opaque.
+#define LOOK_EVERY 64
+// A footprint is walked in quads: pixels p, p + 1, p + STRIDE, p + STRIDE + 1. A quad may reach one pixel beyond its
+// footprint (where alpha is 0) and beyond the tile, into an apron that is never shown and has no gradient.
+#define STRIDE (TILE + 1)
+#define ROOM (STRIDE * STRIDE)
+
+typedef struct { int b, left, top, width, height; } tile_t;
+
+inline tile_t tile_at(int t, int height, int width, int tiles_y, int tiles_x) {
+  tile_t tile;
+  tile.b = t / (tiles_y * tiles_x);
+  tile.left = t % tiles_x * TILE;
+  tile.top = t / tiles_x % tiles_y * TILE;
+  tile.width = min(TILE, width - tile.left);
+  tile.height = min(TILE, height - tile.top);
+  return tile;
+}
+
+inline void read_ahead(global const record_t* records, int e, global const REAL* features) {
+  global const REAL* row = features + (size_t)records[e].id * CHANNELS;
+#pragma unroll
+  for (int c = 0; c < CHANNELS; c += CACHE_LINE / sizeof(REAL)) PREFETCH(row + c);
+}
+
+// Whether no pixel of the tile can change any more.
+inline bool is_opaque(const REAL* transmittance, tile_t tile, REAL min_transmittance) {
+  int open = 0;
+  for (int y = 0; y < tile.height; y++)
+    for (int x = 0; x < tile.width; x++) {
+      const REAL t = transmittance[y * STRIDE + x];
+      open += EXISTS(0, 1, t) & (t != 0);
+    }
+  return open == 0;
+}
+
+// What a quad's alphas need of a point, relative to the tile.
+typedef struct { REAL4 u, v; REAL r2, slope, o; } disc_t;
+
+inline disc_t disc_of(global const record_t* point, tile_t tile) {
+  const disc_t disc = {
+      point->u - tile.left - (REAL)0.5 - (REAL4)(0, 1, 0, 1), point->v - tile.top - (REAL)0.5 - (REAL4)(0, 0, 1, 1),
+      point->r2, point->slope, point->o};
+  return disc;
+}
+
+inline REAL4 load_quad(const REAL* pixels, int p) { return (REAL4)(vload2(0, pixels + p), vload2(0, pixels + p + STRIDE)); }
+inline void store_quad(REAL4 quad, REAL* pixels, int p) {
+  vstore2(quad.lo, 0, pixels + p);
+  vstore2(quad.hi, 0, pixels + p + STRIDE);
+}
+
+// Alphas of the quad at (x, y), and in *before the transmittances t: both 0 where there is no fragment.
+inline REAL4 quad_alphas(disc_t disc, int x, int y, REAL4 t, REAL min_transmittance, REAL4* before) {
+  const REAL4 dx = x - disc.u, dy = y - disc.v, d2 = dx * dx + dy * dy;
+  *before = EXISTS(d2, disc.r2, t) ? t : (REAL4)0;
+  return EXISTS(d2, disc.r2, t) ? disc.o - disc.slope * d2 : (REAL4)0;
+}
 
 kernel void composite_tiles(
     const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
     global const int* restrict tile_starts,   // [B * tiles + 1]
-    global const record_t* restrict records,      // [E]
+    global const record_t* restrict records,  // [E]
     global const REAL* restrict features,     // [P, C]
     global const REAL* restrict backgrounds,  // [B, C]
     global REAL* restrict image,              // [B, H, W, C] out
-    global REAL* restrict coverage)           // [B, H, W] out
+    global REAL* restrict coverage,           // [B, H, W] out
+    global int* restrict tile_finite)         // [B * tiles] out: whether all features met were finite
 {
-  const int t = get_global_id(0);
-  const int tiles = tiles_x * tiles_y;
-  const int b = t / tiles, ty = t % tiles / tiles_x, tx = t % tiles_x;
-  const int left = tx * TILE, top = ty * TILE;
-  const int right = min(left + TILE, width), bottom = min(top + TILE, height);
-  V acc[PIXELS][BLOCKS];
-  REAL trans[PIXELS];
-  for (int p = 0; p < PIXELS; p++) {
-    trans[p] = 1;
+  const int index = get_global_id(0);
+  const tile_t tile = tile_at(index, height, width, tiles_y, tiles_x);
+  vector_t sums[ROOM][BLOCKS];
+  REAL transmittance[ROOM];
+  for (int p = 0; p < ROOM; p++) {
+    transmittance[p] = 1;
 #pragma unroll
-    for (int k = 0; k < BLOCKS; k++) acc[p][k] = 0;
+    for (int k = 0; k < BLOCKS; k++) sums[p][k] = 0;
   }
-  const int begin = tile_starts[t], end = tile_starts[t + 1];
+
+  const int begin = tile_starts[index], end = tile_starts[index + 1];
+  bool finite = true;
   for (int e = begin; e < end; e++) {
-#ifdef AHEAD
-    { int q = min(e + AHEAD, end - 1);  global const REAL* row = features + (size_t)records[q].id * CHANNELS;
-#pragma unroll
-      for (int k = 0; k < CHANNELS; k += 64 / sizeof(REAL)) __builtin_prefetch((const void*)(uintptr_t)(row + k), 0, 3); }
-#endif
+    read_ahead(records, min(e + AHEAD, end - 1), features);
     global const record_t* point = records + e;
-    global const REAL* row = features + (size_t)point->id * CHANNELS;
-    V f[BLOCKS];
-    V bad = 0;
+    vector_t f[BLOCKS];
+    if (!load_row(features + (size_t)point->id * CHANNELS, f)) {
+      finite = false;
+      continue;
+    }
+    const disc_t disc = disc_of(point, tile);
+    const box_t box = unpack_box(point->box);
+    for (int y = box.y0; y < box.y1; y += 2)
+      for (int x = box.x0; x < box.x1; x += 2) {
+        const int p = y * STRIDE + x;
+        REAL4 before;
+        const REAL4 t = load_quad(transmittance, p);
+        const REAL4 a = quad_alphas(disc, x, y, t, min_transmittance, &before), w = a * t;
+        store_quad(t * (1 - a), transmittance, p);
 #pragma unroll
-    for (int k = 0; k < BLOCKS; k++) { f[k] = LOAD(row + AT(k)); bad += f[k] * 0; }
-    if (total(bad) != 0) continue;
-    const REAL u = point->u - left - (REAL)0.5, v = point->v - top - (REAL)0.5, r2 = point->r2, slope = point->slope, o = point->o;
-    const int box = point->box;
-    const int x0 = box & 255, x1 = box >> 8 & 255, y0 = box >> 16 & 255, y1 = (uint)box >> 24;
-#define ONE(x,y) { \
-        const REAL dx = (x) - u, dy = (y) - v; \
-        const REAL d2 = dx * dx + dy * dy; \
-        const int p = (y) * TILE + (x); \
-        const REAL a = d2 < r2 ? o - slope * d2 : (REAL)0; \
-        const REAL w = a * trans[p]; \
-        trans[p] *= 1 - a; \
-        _Pragma("unroll") for (int k = 0; k < BLOCKS; k++) acc[p][k] += w * f[k]; }
-#ifdef QUAD
-    if (x1 - x0 == 2 && y1 - y0 == 2) { ONE(x0,y0); ONE(x0+1,y0); ONE(x0,y0+1); ONE(x0+1,y0+1); continue;}
-#endif
-#ifdef QUAD4
-    if (x1 - x0 == 4) { for (int y = y0; y < y1; y++) { ONE(x0,y); ONE(x0+1,y); ONE(x0+2,y); ONE(x0+3,y); } continue;}
-#endif
-    for (int y = y0; y < y1; y++)
-      for (int x = x0; x < x1; x++) ONE(x,y)
+        for (int k = 0; k < BLOCKS; k++) {
+          sums[p][k] += w.x * f[k];
+          sums[p + 1][k] += w.y * f[k];
+          sums[p + STRIDE][k] += w.z * f[k];
+          sums[p + STRIDE + 1][k] += w.w * f[k];
+        }
+      }
+    if ((e - begin) % LOOK_EVERY == LOOK_EVERY - 1 && is_opaque(transmittance, tile, min_transmittance)) break;
   }
-  global const REAL* back = backgrounds + (size_t)b * CHANNELS;
-  V bg[BLOCKS];
+  tile_finite[index] = finite;
+
+  vector_t background[BLOCKS];
+  load_row(backgrounds + (size_t)tile.b * CHANNELS, background);
+  for (int y = 0; y < tile.height; y++)
+    for (int x = 0; x < tile.width; x++) {
+      const int p = y * STRIDE + x;
+      const size_t at = ((size_t)tile.b * height + tile.top + y) * width + tile.left + x;
+      coverage[at] = 1 - transmittance[p];
 #pragma unroll
-  for (int k = 0; k < BLOCKS; k++) bg[k] = LOAD(back + AT(k));
-  for (int y = top; y < bottom; y++)
-    for (int x = left; x < right; x++) {
-      const int p = (y - top) * TILE + (x - left);
-      const size_t at = ((size_t)b * height + y) * width + x;
-      coverage[at] = 1 - trans[p];
-      global REAL* to = image + at * CHANNELS;
-#pragma unroll
-      for (int k = 0; k < BLOCKS; k++)
-#ifdef STREAM
-       __builtin_nontemporal_store(acc[p][k] + trans[p] * bg[k], (global V*)(to + AT(k)));
-#else
-       STORE(acc[p][k] + trans[p] * bg[k], to + AT(k));
-#endif
+      for (int k = 0; k < BLOCKS; k++) sums[p][k] += transmittance[p] * background[k];
+      stream_row(sums[p], image + at * CHANNELS);
     }
 }
+
+#ifdef GRAD_FEATURES
+// What the backward keeps of one segment, quad by quad, and of the tile's pixels.
+typedef struct { REAL4 alpha, before; } quad_t;  // a_i and T_i, 0 and 0 where there is no fragment
+typedef struct {
+  quad_t quads[SEGMENT / 4];
+  REAL transmittance[ROOM];
+} walk_t;
+
+// Walk forward from entry e until the segment is full or the list ends; returns the entry after the last.
+inline int walk_forward(
+    walk_t* walk, int e, int end, bool all_finite, tile_t tile, REAL min_transmittance,
+    global const record_t* records, global const REAL* features) {
+  for (int slot = 0; e < end; e++) {
+    global const record_t* point = records + e;
+    const box_t box = unpack_box(point->box);
+    if (slot + quads_in(box) > SEGMENT / 4) break;
+    bool finite = true;
+    if (!all_finite) {
+      vector_t f[BLOCKS];
+      finite = load_row(features + (size_t)point->id * CHANNELS, f);
+    }
+    disc_t disc = disc_of(point, tile);
+    if (!finite) disc.r2 = 0;
+    for (int y = box.y0; y < box.y1; y += 2)
+      for (int x = box.x0; x < box.x1; x += 2, slot++) {
+        const int p = y * STRIDE + x;
+        const REAL4 t = load_quad(walk->transmittance, p);
+        quad_t quad;
+        quad.alpha = quad_alphas(disc, x, y, t, min_transmittance, &quad.before);
+        walk->quads[slot] = quad;
+        store_quad(t * (1 - quad.alpha), walk->transmittance, p);
+      }
+  }
+  return e;
+}
+
+// The gradients at the tile's pixels, 0 outside the image and in the apron. Lanes that overlap are 0, to count once
+// in a dot product.
+inline void load_grad_image(
+    vector_t grads[ROOM][BLOCKS], tile_t tile, int height, int width, long pixel_stride, long channel_stride,
+    global const REAL* grad_image) {
+  const bool partial = tile.width < TILE || tile.height < TILE;
+  for (int p = 0; p < ROOM; p += partial || p >= TILE * STRIDE ? 1 : STRIDE)
+#pragma unroll
+    for (int k = 0; k < BLOCKS; k++) grads[partial || p >= TILE * STRIDE ? p : p + TILE][k] = 0;
+  for (int y = 0; y < tile.height; y++) {
+    global const REAL* row = grad_image + ((long)tile.b * height * width * CHANNELS) +
+                             ((long)(tile.top + y) * width + tile.left) * pixel_stride;
+    REAL* to = (REAL*)grads[y * STRIDE];
+    if (channel_stride == 1)
+      for (int x = 0; x < tile.width; x++) {
+        load_row(row + x * pixel_stride, grads[y * STRIDE + x]);
+        for (int lane = 0; lane < OVERLAP; lane++) to[(x * BLOCKS + BLOCKS - 1) * VECTOR + lane] = 0;
+      }
+    else
+      for (int k = 0; k < BLOCKS; k++)
+        for (int lane = 0; lane < VECTOR; lane++) {
+          const bool again = k == BLOCKS - 1 && lane < OVERLAP;
+          global const REAL* from = row + (BLOCK_START(k) + lane) * channel_stride;
+          for (int x = 0; x < tile.width; x++)
+            to[(x * BLOCKS + k) * VECTOR + lane] = again ? (REAL)0 : from[x * pixel_stride];
+        }
+  }
+}
+
+// What lies behind the last fragment of every pixel: A_end, and the background's gradient of the tile.
+inline void look_behind(
+    const vector_t g[ROOM][BLOCKS], const REAL* transmittance, tile_t tile, int height, int width,
+    global const REAL* background_row, global const REAL* grad_coverage, REAL* behind, vector_t* grad_background) {
+  vector_t background[BLOCKS];
+  load_row(background_row, background);
+  for (int p = 0; p < ROOM; p++) behind[p] = 0;
+  for (int k = 0; k < BLOCKS; k++) grad_background[k] = 0;
+  for (int y = 0; y < tile.height; y++) {
+    vector_t row_sum[BLOCKS];
+    for (int k = 0; k < BLOCKS; k++) row_sum[k] = 0;
+    for (int x = 0; x < tile.width; x++) {
+      const int p = y * STRIDE + x;
+      vector_t products = 0;
+#pragma unroll
+      for (int k = 0; k < BLOCKS; k++) {
+        products += background[k] * g[p][k];
+        row_sum[k] += transmittance[p] * g[p][k];
+      }
+      const size_t at = ((size_t)tile.b * height + tile.top + y) * width + tile.left + x;
+      behind[p] = sum_lanes(products) - grad_coverage[at];
+    }
+    for (int k = 0; k < BLOCKS; k++) grad_background[k] += row_sum[k];
+  }
+}
+
+// Walk a segment's entries back to front, writing or adding to their points' gradients.
+inline void walk_back(
+    const walk_t* walk, const vector_t g[ROOM][BLOCKS], REAL* behind, int first, int stop, tile_t tile,
+    global const record_t* records, global const REAL* features, global REAL* grad_features,
+    global REAL* grad_points_uv, global REAL* grad_radii, global REAL* grad_opacities) {
+  int slot = 0;
+  for (int e = first; e < stop; e++) slot += quads_in(unpack_box(records[e].box));
+  for (int e = stop - 1; e >= first; e--) {
+    read_ahead(records, max(e - AHEAD, first), features);
+    global const record_t* point = records + e;
+    const int id = point->id;
+    const box_t box = unpack_box(point->box);
+    const disc_t disc = disc_of(point, tile);
+    vector_t f[BLOCKS], grad_f[BLOCKS];
+    const bool finite = load_row(features + (size_t)id * CHANNELS, f);
+#pragma unroll
+    for (int k = 0; k < BLOCKS; k++) {
+      grad_f[k] = 0;
+      if (!finite) f[k] = 0;
+    }
+    slot -= quads_in(box);
+    const quad_t* quad = walk->quads + slot;
+    REAL4 sum_da = 0, sum_dx = 0, sum_dy = 0, sum_d2 = 0;
+    for (int y = box.y0; y < box.y1; y += 2)
+      for (int x = box.x0; x < box.x1; x += 2, quad++) {
+        const int p = y * STRIDE + x;
+        const REAL4 a = quad->alpha, t = quad->before, w = a * t;
+#if GRAD_GEOMETRY
+        vector_t products[4] = {0, 0, 0, 0};
+#pragma unroll
+        for (int k = 0; k < BLOCKS; k++) {
+          products[0] += f[k] * g[p][k];
+          products[1] += f[k] * g[p + 1][k];
+          products[2] += f[k] * g[p + STRIDE][k];
+          products[3] += f[k] * g[p + STRIDE + 1][k];
+        }
+        const REAL4 fg = sum_lanes_of_four(products), after = load_quad(behind, p);
+        const REAL4 da = t * (fg - after);
+        store_quad(a * fg + (1 - a) * after, behind, p);
+        const REAL4 dx = x - disc.u, dy = y - disc.v;
+        sum_da += da;
+        sum_dx += da * dx;
+        sum_dy += da * dy;
+        sum_d2 += da * (dx * dx + dy * dy);
+#endif
+#if GRAD_FEATURES
+#pragma unroll
+        for (int k = 0; k < BLOCKS; k++)
+          grad_f[k] += w.x * g[p][k] + w.y * g[p + 1][k] + w.z * g[p + STRIDE][k] + w.w * g[p + STRIDE + 1][k];
+#endif
+      }
+    const bool whole = is_whole(point->box);
+#if GRAD_FEATURES
+    global REAL* row = grad_features + (size_t)id * CHANNELS;
+    if (!whole) add_row(grad_f, row);
+    else stream_row(grad_f, row);
+#endif
+#if GRAD_GEOMETRY
+    const REAL slope = 2 * point->slope, d2 = sum_of_four(sum_d2);
+    const point_grads_t grads = {
+        slope * sum_of_four(sum_dx), slope * sum_of_four(sum_dy), slope * d2 / point->r,
+        sum_of_four(sum_da) - d2 / point->r2};
+    write_scalars(grads, id, whole, grad_points_uv, grad_radii, grad_opacities);
+#endif
+  }
+}
+
+// Kernel for the tiles (x0 + i * step_x, y0 + j * step_y): no two of them share a point, so each adds to the
+// gradients of its points alone. Rows of points that lie in one tile only are written, the others were cleared.
+kernel void composite_tiles_backward(
+    const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
+    const int x0, const int y0, const int step_x, const int step_y,
+    const long pixel_stride, const long channel_stride,
+    global const int* restrict tile_starts,         // [B * tiles + 1]
+    global const record_t* restrict records,        // [E]
+    global const REAL* restrict features,           // [P, C]
+    global const REAL* restrict backgrounds,        // [B, C]
+    global const int* restrict tile_finite,         // [B * tiles]
+    global const REAL* restrict grad_image,         // [B, C, H, W] by strides
+    global const REAL* restrict grad_coverage,      // [B, H, W]
+    global const int* restrict checkpoint_starts,   // [B * tiles]
+    global REAL* restrict checkpoints,              // [S, ROOM] room
+    global int* restrict checkpoint_entries,        // [S] room
+    global REAL* restrict grad_features,            // [P, C] out
+    global REAL* restrict grad_points_uv,           // [P, 2] out
+    global REAL* restrict grad_radii,               // [P] out
+    global REAL* restrict grad_opacities,           // [P] out
+    global REAL* restrict tile_grad_backgrounds)    // [B * tiles, C] out
+{
+  const int tx = x0 + (int)get_global_id(0) * step_x, ty = y0 + (int)get_global_id(1) * step_y;
+  const int index = ((int)get_global_id(2) * tiles_y + ty) * tiles_x + tx;
+  const tile_t tile = tile_at(index, height, width, tiles_y, tiles_x);
+  const int begin = tile_starts[index], end = tile_starts[index + 1];
+  const bool finite = tile_finite[index];
+#if !GRAD_BACKGROUNDS
+  if (begin == end) return;
+#endif
+  vector_t g[ROOM][BLOCKS];
+  load_grad_image(g, tile, height, width, pixel_stride, channel_stride, grad_image);
+
+  // Forward, keeping the first transmittances of every segment but the first.
+  walk_t walk;
+  for (int p = 0; p < ROOM; p++) walk.transmittance[p] = 1;
+  int segment = 0, first = begin;
+  int stop = walk_forward(&walk, begin, end, finite, tile, min_transmittance, records, features);
+  while (stop < end) {
+    const int at = checkpoint_starts[index] + ++segment;
+    checkpoint_entries[at] = first = stop;
+    for (int p = 0; p < ROOM; p++) checkpoints[(size_t)at * ROOM + p] = walk.transmittance[p];
+    stop = walk_forward(&walk, first, end, finite, tile, min_transmittance, records, features);
+  }
+
+  REAL behind[ROOM];
+  vector_t grad_background[BLOCKS];
+  look_behind(
+      g, walk.transmittance, tile, height, width, backgrounds + (size_t)tile.b * CHANNELS, grad_coverage, behind,
+      grad_background);
+#if GRAD_BACKGROUNDS
+  store_row(grad_background, tile_grad_backgrounds + (size_t)index * CHANNELS);
+#endif
+
+  // Backward, segment by segment.
+  for (;;) {
+    walk_back(
+        &walk, g, behind, first, stop, tile, records, features, grad_features, grad_points_uv, grad_radii,
+        grad_opacities);
+    if (segment == 0) break;
+    const int at = checkpoint_starts[index] + --segment;
+    first = segment == 0 ? begin : checkpoint_entries[at];
+    for (int p = 0; p < ROOM; p++) walk.transmittance[p] = segment == 0 ? (REAL)1 : checkpoints[(size_t)at * ROOM + p];
+    stop = walk_forward(&walk, first, end, finite, tile, min_transmittance, records, features);
+  }
+}
+#endif

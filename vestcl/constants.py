@@ -10,8 +10,6 @@ NEAR: Final = 0.1
 #: clamp) then touches at most 2 x 2 tiles, and 16 x 16 x 32 float32 accumulators fit a 48 KiB L1 cache.
 TILE: Final = 16
 
-#: Width of the kernels' channel vectors: one 512-bit register of float32, two 256-bit ones.
-VECTOR: Final = 16
 
 #: Fragments whose alpha and transmittance the CPU backward keeps at a time, per tile. At least one
 #: point's largest footprint (TILE * TILE); 4096 keeps them in L1/L2 and a street tile in one segment.
@@ -22,3 +20,11 @@ QUATERNION_FLOOR: Final = 1e-8
 
 #: The tile kernels keep TILE * TILE * C accumulators in private memory; 1024 channels are 1 MiB in float32.
 MAX_CHANNELS: Final = 1024
+
+#: Bytes of a cache line. Image rows that are whole lines are written past the cache.
+CACHE_LINE: Final = 64
+
+#: Outputs of this many bytes and more are recycled (below, the C library recycles them itself) ...
+HOST_POOL_FROM: Final = 1 << 18
+#: ... and at most so many bytes of them are kept: the outputs of a training step at 256 x 832.
+HOST_POOL_BYTES: Final = 1 << 29

@@ -1,0 +1,46 @@
+# make demo, make test: everything else follows from these two. PYTHON chooses the interpreter of the environment.
+SHELL := /bin/bash
+PYTHON ?= python3
+BIN := .venv/bin
+OUT ?= out
+
+.PHONY: venv demo test lint bench oclgrind devices-test clean
+
+venv: .venv/.installed
+
+# torch comes first and alone: its exact version decides between a build for the CPU and gigabytes of CUDA.
+.venv/.installed: setup.py constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --constraint constraints.txt setuptools torch
+	$(BIN)/python -m pip install --constraint constraints.txt --no-build-isolation --editable '.[dev]'
+	touch $@
+
+demo: venv
+	$(BIN)/vestcl demo --out '$(OUT)'
+
+lint: venv
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy vestcl
+
+test: lint
+	$(BIN)/pytest -q
+
+bench: venv
+	$(BIN)/vestcl bench splat
+
+# The operators' tests on every OpenCL device of this machine instead of the default one.
+devices-test: venv
+	VESTCL_TEST_DEVICES=all $(BIN)/pytest -q
+
+# Data races and uninitialised reads: small scenes on Oclgrind's simulated device. It exits 0 whatever it finds.
+oclgrind: venv
+	@command -v oclgrind > /dev/null || { echo "oclgrind is not installed: apt install oclgrind" >&2; exit 1; }
+	@mkdir -p '$(OUT)' && rm -f '$(OUT)/oclgrind.log'
+	VESTCL_DEVICE=oclgrind oclgrind --data-races --uninitialized --log '$(OUT)/oclgrind.log' \
+	    $(BIN)/python tests/oclgrind_scenes.py
+	@if test -s '$(OUT)/oclgrind.log'; then cat '$(OUT)/oclgrind.log' >&2; exit 1; fi
+
+clean:
+	rm -rf .venv build dist ./*.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,108 @@
+// A row of CHANNELS numbers as BLOCKS vectors of VECTOR lanes. Where VECTOR does not divide CHANNELS the last
+// vector overlaps the one before by OVERLAP lanes, so that every access stays inside the row and is a whole vector.
+//   CHANNELS   numbers a row
+//   VECTOR     1, 4, 8 or 16 lanes, at most CHANNELS
+//   STREAM     1: rows are whole, aligned cache lines and VECTOR divides them; write them past the cache
+#ifndef CHANNELS
+#error "define CHANNELS, the number of features of a point"
+#endif
+#ifndef VECTOR
+#error "define VECTOR, the lanes of a vector of channels"
+#endif
+#ifndef STREAM
+#error "define STREAM as 0 or 1"
+#endif
+#define BLOCKS ((CHANNELS + VECTOR - 1) / VECTOR)
+#define BLOCK_START(k) ((k) == BLOCKS - 1 ? CHANNELS - VECTOR : (k) * VECTOR)
+#define OVERLAP (BLOCKS * VECTOR - CHANNELS)
+
+#if VECTOR == 1
+typedef REAL vector_t;
+typedef REAL loose_vector_t;
+inline REAL sum_lanes(vector_t v) { return v; }
+#else
+typedef JOIN(REAL, VECTOR) vector_t;
+typedef vector_t __attribute__((aligned(REAL_BITS / 8))) loose_vector_t;  // rows are aligned to their numbers only
+#if VECTOR == 4
+inline REAL sum_lanes(vector_t v) {
+  const REAL2 first = v.lo + v.hi;
+  return first.x + first.y;
+}
+#elif VECTOR == 8
+inline REAL sum_lanes(vector_t v) {
+  const REAL4 first = v.lo + v.hi;
+  const REAL2 second = first.lo + first.hi;
+  return second.x + second.y;
+}
+#else
+inline REAL sum_lanes(vector_t v) {
+  const JOIN(REAL, 8) first = v.lo + v.hi;
+  const REAL4 second = first.lo + first.hi;
+  const REAL2 third = second.lo + second.hi;
+  return third.x + third.y;
+}
+#endif
+#endif
+
+inline REAL sum_of_four(REAL4 v) { return (v.x + v.y) + (v.z + v.w); }
+
+#if VECTOR == 1
+inline REAL4 sum_lanes_of_four(const vector_t* v) { return (REAL4)(v[0], v[1], v[2], v[3]); }
+#else
+#if VECTOR == 4
+#define TO_FOUR(v) (v)
+#elif VECTOR == 8
+#define TO_FOUR(v) ((v).lo + (v).hi)
+#else
+#define TO_FOUR(v) (((v).lo.lo + (v).lo.hi) + ((v).hi.lo + (v).hi.hi))
+#endif
+// The four sums of the lanes of four vectors, by transposing.
+inline REAL4 sum_lanes_of_four(const vector_t* v) {
+  const REAL4 a = TO_FOUR(v[0]), b = TO_FOUR(v[1]), c = TO_FOUR(v[2]), d = TO_FOUR(v[3]);
+  const REAL4 ab = (REAL4)(a.lo, b.lo) + (REAL4)(a.hi, b.hi), cd = (REAL4)(c.lo, d.lo) + (REAL4)(c.hi, d.hi);
+  return (REAL4)(ab.even, cd.even) + (REAL4)(ab.odd, cd.odd);
+}
+#endif
+
+// Read a row; false where one of its numbers is NaN or infinite (x * 0 is 0 only for finite x).
+inline bool load_row(global const REAL* row, vector_t* blocks) {
+  vector_t zero = 0;
+#pragma unroll
+  for (int k = 0; k < BLOCKS; k++) {
+    blocks[k] = *(global const loose_vector_t*)(row + BLOCK_START(k));
+    zero += blocks[k] * 0;
+  }
+  return sum_lanes(zero) == 0;
+}
+
+// Write blocks to a row, the overlapping one first: the lanes that it shares come right from the one before.
+inline void store_row(const vector_t* blocks, global REAL* row) {
+#pragma unroll
+  for (int k = BLOCKS - 1; k >= 0; k--) *(global loose_vector_t*)(row + BLOCK_START(k)) = blocks[k];
+}
+
+inline void stream_row(const vector_t* blocks, global REAL* row) {
+#if STREAM
+#pragma unroll
+  for (int k = 0; k < BLOCKS; k++) __builtin_nontemporal_store(blocks[k], (global vector_t*)(row + BLOCK_START(k)));
+#else
+  store_row(blocks, row);
+#endif
+}
+
+inline void add_row(const vector_t* blocks, global REAL* row) {
+  vector_t sums[BLOCKS];
+#pragma unroll
+  for (int k = 0; k < BLOCKS; k++) sums[k] = *(global const loose_vector_t*)(row + BLOCK_START(k)) + blocks[k];
+  store_row(sums, row);
+}
+
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_prefetch)
+#define PREFETCH(pointer) __builtin_prefetch((const void*)(uintptr_t)(pointer), 0, 3)
+#endif
+#endif
+#ifndef PREFETCH
+#define PREFETCH(pointer)
+#endif
+#define CACHE_LINE 64

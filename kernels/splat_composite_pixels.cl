@@ -1,0 +1,228 @@
+// Compositing, one work-group a tile and one work-item a pixel: the mapping for GPUs. The formulas are those of
+// splat_composite.cl.
+//
+// Forward: the group stages GROUP points of the tile's list at a time in local memory, and each work-item composites
+// those that reach its pixel. Backward, three steps, none of which adds to what another work-item writes:
+//   1. each pixel walks its fragments forward and back and leaves w_i and dL/da_i in the slot of (entry, pixel),
+//   2. each entry sums over its slots; entries of a point in several tiles run in several launches, as in
+//      splat_composite.cl, so that each adds to the point's gradients alone,
+//   3. each tile sums its pixels' share of the background's gradient.
+//
+//   CHANNELS         features of a point
+//   CHANNEL_GROUP    channels that one work-item of the forward keeps in registers
+#include "common.h"
+#include "splat.h"
+#ifndef CHANNELS
+#error "define CHANNELS, the number of features of a point"
+#endif
+#ifndef CHANNEL_GROUP
+#error "define CHANNEL_GROUP, the channels that a work-item composites"
+#endif
+#ifndef TRUNCATE
+#error "define TRUNCATE as 0 or 1"
+#endif
+#include "splat_gradients.h"
+#define GROUP (TILE * TILE)
+
+#if TRUNCATE
+#define EXISTS(d2, r2, t) ((d2) < (r2) && (t) >= min_transmittance)
+#else
+#define EXISTS(d2, r2, t) ((d2) < (r2))
+#endif
+
+// One work-item a point: whether all its features are finite.
+kernel void find_finite(const int points, global const REAL* restrict features, global int* restrict finite) {
+  const int i = get_global_id(0);
+  if (i >= points) return;
+  REAL zero = 0;
+  for (int c = 0; c < CHANNELS; c++) zero += features[(size_t)i * CHANNELS + c] * 0;
+  finite[i] = zero == 0;
+}
+
+// The group copies entries [e, e + GROUP) of its list; those that make no fragment get r2 = 0.
+inline void stage(
+    local record_t* staged, int lane, int e, int end, global const record_t* records, global const int* finite) {
+  if (e + lane < end) {
+    record_t record = records[e + lane];
+    if (!finite[record.id]) record.r2 = 0;
+    staged[lane] = record;
+  }
+}
+
+kernel void composite_pixels(
+    const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
+    global const int* restrict tile_starts,   // [B * tiles + 1]
+    global const record_t* restrict records,  // [E]
+    global const int* restrict finite,        // [P]
+    global const REAL* restrict features,     // [P, C]
+    global const REAL* restrict backgrounds,  // [B, C]
+    global REAL* restrict image,              // [B, H, W, C] out
+    global REAL* restrict coverage)           // [B, H, W] out
+{
+  local record_t staged[GROUP];
+  const int lane = get_local_id(0), index = get_group_id(0), first = get_global_id(1) * CHANNEL_GROUP;
+  const int channels = min(CHANNEL_GROUP, CHANNELS - first);
+  const int b = index / (tiles_y * tiles_x);
+  const int x = index % tiles_x * TILE + lane % TILE, y = index / tiles_x % tiles_y * TILE + lane / TILE;
+  REAL sums[CHANNEL_GROUP];
+  for (int c = 0; c < CHANNEL_GROUP; c++) sums[c] = 0;
+  REAL t = 1;
+  const int begin = tile_starts[index], end = tile_starts[index + 1];
+  for (int e = begin; e < end; e += GROUP) {
+    barrier(CLK_LOCAL_MEM_FENCE);
+    stage(staged, lane, e, end, records, finite);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    const int count = min(GROUP, end - e);
+    for (int i = 0; i < count; i++) {
+      const REAL dx = x + (REAL)0.5 - staged[i].u, dy = y + (REAL)0.5 - staged[i].v, d2 = dx * dx + dy * dy;
+      if (!EXISTS(d2, staged[i].r2, t)) continue;
+      const REAL a = staged[i].o - staged[i].slope * d2, w = a * t;
+      global const REAL* row = features + (size_t)staged[i].id * CHANNELS + first;
+      for (int c = 0; c < channels; c++) sums[c] += w * row[c];
+      t *= 1 - a;
+    }
+  }
+  if (x < width && y < height) {
+    const size_t at = ((size_t)b * height + y) * width + x;
+    if (first == 0) coverage[at] = 1 - t;
+    for (int c = 0; c < channels; c++)
+      image[at * CHANNELS + first + c] = sums[c] + t * backgrounds[b * CHANNELS + first + c];
+  }
+}
+
+#ifdef GRAD_FEATURES
+inline int slot_in(box_t box, int x, int y) { return (y - box.y0) * (box.x1 - box.x0) + x - box.x0; }
+
+// Step 1.
+kernel void composite_pixels_backward(
+    const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
+    const long pixel_stride, const long channel_stride,
+    global const int* restrict tile_starts,     // [B * tiles + 1]
+    global const record_t* restrict records,    // [E]
+    global const long* restrict tile_slot_starts,  // [B * tiles]
+    global const long* restrict slot_starts,    // [E], from there on
+    global const int* restrict finite,          // [P]
+    global const REAL* restrict features,       // [P, C]
+    global const REAL* restrict backgrounds,    // [B, C]
+    global const REAL* restrict grad_image,     // [B, C, H, W] by strides
+    global const REAL* restrict grad_coverage,  // [B, H, W]
+    global REAL* restrict slot_weights,         // [S] out: w_i
+    global REAL* restrict slot_grads,           // [S] out: dL/da_i
+    global REAL* restrict transmittance)        // [B, H, W] out: T_end
+{
+  const int lane = get_local_id(0), index = get_group_id(0);
+  const int b = index / (tiles_y * tiles_x);
+  const int left = index % tiles_x * TILE, top = index / tiles_x % tiles_y * TILE;
+  const int column = lane % TILE, line = lane / TILE, x = left + column, y = top + line;
+  if (x >= width || y >= height) return;
+  const int begin = tile_starts[index], end = tile_starts[index + 1];
+  REAL t = 1;
+  for (int e = begin; e < end; e++) {
+    const box_t box = unpack_box(records[e].box);
+    if (column < box.x0 || column >= box.x1 || line < box.y0 || line >= box.y1) continue;
+    const REAL dx = x + (REAL)0.5 - records[e].u, dy = y + (REAL)0.5 - records[e].v, d2 = dx * dx + dy * dy;
+    const bool exists = EXISTS(d2, records[e].r2, t) && finite[records[e].id];
+    const REAL a = exists ? records[e].o - records[e].slope * d2 : (REAL)0;
+    const size_t slot = tile_slot_starts[index] + slot_starts[e] + slot_in(box, column, line);
+    slot_weights[slot] = exists ? t : (REAL)0;
+    slot_grads[slot] = a;
+    t *= 1 - a;
+  }
+  const size_t at = ((size_t)b * height + y) * width + x;
+  transmittance[at] = t;
+  global const REAL* g = grad_image + (long)b * height * width * CHANNELS + ((long)y * width + x) * pixel_stride;
+  REAL behind = -grad_coverage[at];
+  for (int c = 0; c < CHANNELS; c++) behind += backgrounds[b * CHANNELS + c] * g[c * channel_stride];
+  for (int e = end - 1; e >= begin; e--) {
+    const box_t box = unpack_box(records[e].box);
+    if (column < box.x0 || column >= box.x1 || line < box.y0 || line >= box.y1) continue;
+    const size_t slot = tile_slot_starts[index] + slot_starts[e] + slot_in(box, column, line);
+    const REAL before = slot_weights[slot], a = slot_grads[slot];
+    if (a == 0 && before == 0) continue;
+    REAL fg = 0;
+    for (int c = 0; c < CHANNELS; c++)
+      fg += features[(size_t)records[e].id * CHANNELS + c] * g[c * channel_stride];
+    slot_weights[slot] = a * before;
+    slot_grads[slot] = before * (fg - behind);
+    behind = a * fg + (1 - a) * behind;
+  }
+}
+
+// Step 2, for the tiles (x0 + i * step_x, y0 + j * step_y): no two of them share a point.
+kernel void sum_slots(
+    const int height, const int width, const int tiles_y, const int tiles_x,
+    const int x0, const int y0, const int step_x, const int step_y,
+    const long pixel_stride, const long channel_stride,
+    global const int* restrict tile_starts,     // [B * tiles + 1]
+    global const record_t* restrict records,    // [E]
+    global const long* restrict tile_slot_starts,  // [B * tiles]
+    global const long* restrict slot_starts,    // [E], from there on
+    global const REAL* restrict slot_weights,   // [S]
+    global const REAL* restrict slot_grads,     // [S]
+    global const REAL* restrict grad_image,     // [B, C, H, W] by strides
+    global REAL* restrict grad_features,        // [P, C] out
+    global REAL* restrict grad_points_uv,       // [P, 2] out
+    global REAL* restrict grad_radii,           // [P] out
+    global REAL* restrict grad_opacities)       // [P] out
+{
+  const int lane = get_local_id(0);
+  const int tx = x0 + (int)get_group_id(0) * step_x, ty = y0 + (int)get_group_id(1) * step_y, b = get_group_id(2);
+  const int index = (b * tiles_y + ty) * tiles_x + tx;
+  const int left = tx * TILE, top = ty * TILE;
+  for (int e = tile_starts[index] + lane; e < tile_starts[index + 1]; e += GROUP) {
+    const record_t point = records[e];
+    const box_t box = unpack_box(point.box);
+    const bool whole = is_whole(point.box);
+    const size_t slots = tile_slot_starts[index] + slot_starts[e];
+    global const REAL* g = grad_image + (long)b * height * width * CHANNELS + ((long)top * width + left) * pixel_stride;
+#if GRAD_FEATURES
+    for (int c = 0; c < CHANNELS; c++) {
+      REAL sum = 0;
+      for (int y = box.y0; y < box.y1; y++)
+        for (int x = box.x0; x < box.x1; x++)
+          sum += slot_weights[slots + slot_in(box, x, y)] * g[((long)y * width + x) * pixel_stride + c * channel_stride];
+      const size_t at = (size_t)point.id * CHANNELS + c;
+      grad_features[at] = (whole ? (REAL)0 : grad_features[at]) + sum;
+    }
+#endif
+#if GRAD_GEOMETRY
+    REAL sum_da = 0, sum_dx = 0, sum_dy = 0, sum_d2 = 0;
+    for (int y = box.y0; y < box.y1; y++)
+      for (int x = box.x0; x < box.x1; x++) {
+        const REAL da = slot_grads[slots + slot_in(box, x, y)];
+        const REAL dx = left + x + (REAL)0.5 - point.u, dy = top + y + (REAL)0.5 - point.v;
+        sum_da += da;
+        sum_dx += da * dx;
+        sum_dy += da * dy;
+        sum_d2 += da * (dx * dx + dy * dy);
+      }
+    const point_grads_t grads = {
+        2 * point.slope * sum_dx, 2 * point.slope * sum_dy, 2 * point.slope * sum_d2 / point.r,
+        sum_da - sum_d2 / point.r2};
+    write_scalars(grads, point.id, whole, grad_points_uv, grad_radii, grad_opacities);
+#endif
+  }
+}
+
+// Step 3, one work-item a channel of a tile.
+kernel void sum_tile_backgrounds(
+    const int height, const int width, const int tiles_y, const int tiles_x,
+    const long pixel_stride, const long channel_stride,
+    global const REAL* restrict transmittance,       // [B, H, W]
+    global const REAL* restrict grad_image,          // [B, C, H, W] by strides
+    global REAL* restrict tile_grad_backgrounds)     // [B * tiles, C] out
+{
+  const int c = get_global_id(0), index = get_global_id(1);
+  const int b = index / (tiles_y * tiles_x);
+  const int left = index % tiles_x * TILE, top = index / tiles_x % tiles_y * TILE;
+  global const REAL* g = grad_image + (long)b * height * width * CHANNELS + c * channel_stride;
+  REAL sum = 0;
+  for (int y = top; y < min(top + TILE, height); y++) {
+    REAL row = 0;
+    for (int x = left; x < min(left + TILE, width); x++)
+      row += transmittance[((size_t)b * height + y) * width + x] * g[((long)y * width + x) * pixel_stride];
+    sum += row;
+  }
+  tile_grad_backgrounds[(size_t)index * CHANNELS + c] = sum;
+}
+#endif

@@ -1,0 +1,60 @@
+// What both mappings of the backward share: which gradients are computed, and those no tile computes alone.
+//   GRAD_FEATURES, GRAD_POINTS_UV, GRAD_RADII, GRAD_OPACITIES, GRAD_BACKGROUNDS   0 or 1
+#ifdef GRAD_FEATURES
+#define GRAD_GEOMETRY (GRAD_POINTS_UV || GRAD_RADII || GRAD_OPACITIES)
+
+// Gradients of one point, summed over its fragments in this tile.
+typedef struct { REAL u, v, r, o; } point_grads_t;
+
+inline void write_scalars(
+    point_grads_t grads, int id, bool first, global REAL* grad_points_uv, global REAL* grad_radii,
+    global REAL* grad_opacities) {
+#if GRAD_POINTS_UV
+  const REAL2 old_uv = first ? (REAL2)(0) : vload2(id, grad_points_uv);
+  vstore2(old_uv + (REAL2)(grads.u, grads.v), id, grad_points_uv);
+#endif
+#if GRAD_RADII
+  grad_radii[id] = (first ? (REAL)0 : grad_radii[id]) + grads.r;
+#endif
+#if GRAD_OPACITIES
+  grad_opacities[id] = (first ? (REAL)0 : grad_opacities[id]) + grads.o;
+#endif
+}
+
+// One work-item a chunk of points: the gradients that no tile writes outright become 0.
+kernel void clear_gradients(
+    const int points,
+    global const int* restrict places,   // [P], see splat_bin.cl
+    global REAL* restrict grad_features, global REAL* restrict grad_points_uv, global REAL* restrict grad_radii,
+    global REAL* restrict grad_opacities)
+{
+  const int c = get_global_id(0), chunks = get_global_size(0);
+  const int begin = (long)points * c / chunks, end = (long)points * (c + 1) / chunks;
+  const point_grads_t none = {0, 0, 0, 0};
+  for (int i = begin; i < end; i++) {
+    if (is_in_one_tile(places[i])) continue;
+#if GRAD_FEATURES
+    global REAL* row = grad_features + (size_t)i * CHANNELS;
+    for (int c = 0; c < CHANNELS; c++) row[c] = 0;
+#endif
+    write_scalars(none, i, true, grad_points_uv, grad_radii, grad_opacities);
+  }
+}
+
+// One work-item a channel of an image: its tiles' gradients summed in order, with Kahan's compensation.
+kernel void sum_grad_backgrounds(
+    const int tiles,
+    global const REAL* restrict tile_grad_backgrounds,  // [B, tiles, C]
+    global REAL* restrict grad_backgrounds)             // [B, C] out
+{
+  const int c = get_global_id(0), b = get_global_id(1);
+  REAL sum = 0, lost = 0;
+  for (int t = 0; t < tiles; t++) {
+    const REAL next = tile_grad_backgrounds[((size_t)b * tiles + t) * CHANNELS + c] - lost;
+    const REAL larger = sum + next;
+    lost = (larger - sum) - next;
+    sum = larger;
+  }
+  grad_backgrounds[b * CHANNELS + c] = sum;
+}
+#endif

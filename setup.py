@@ -1,0 +1,39 @@
+"""What pip needs to know about vestcl. Versions are ranges here; constraints.txt has the exact ones that are tested."""
+
+from setuptools import find_packages, setup
+
+setup(
+    name="vestcl",
+    version="0.1.0",
+    description="Differentiable point splatting in OpenCL for PyTorch, and forecasts of driving video from new views",
+    license="Apache-2.0",
+    license_files=["LICENSE"],
+    python_requires=">=3.10",
+    # The kernels live beside the package in a checkout and inside it in a wheel; runtime.kernel_folder() knows both.
+    packages=[*find_packages(include=["vestcl", "vestcl.*"]), "vestcl.kernels"],
+    package_dir={"vestcl.kernels": "kernels"},
+    package_data={"vestcl.kernels": ["*.cl", "*.h"]},
+    install_requires=[
+        "matplotlib>=3.8",
+        "numpy>=1.26",
+        "pillow>=10",
+        "pyopencl[pocl]>=2024.2",
+        "rich>=13",
+        "torch>=2.4",
+        "tyro>=0.9",
+    ],
+    extras_require={
+        "dev": [
+            "hypothesis>=6.100",
+            "ipykernel>=6.29",
+            "mypy>=1.11",
+            "nbclient>=0.10",
+            "nbformat>=5.10",
+            "pytest>=8",
+            "ruff>=0.8",
+            "setuptools>=77",
+        ],
+        "intel": ["intel-cmplr-lib-rt", "intel-opencl-rt"],
+    },
+    entry_points={"console_scripts": ["vestcl = vestcl.cli:main"]},
+)

@@ -1,0 +1,68 @@
+"""Fixtures: the OpenCL devices that operators are tested on, and the precisions.
+
+VESTCL_TEST_DEVICES: "all" tests every device, a comma-separated list of selectors tests those ("pocl,nvidia");
+without it, the default device.
+"""
+
+import os
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from vestcl import runtime
+
+torch.set_num_threads(2)
+
+
+def _devices() -> list[runtime.DeviceInfo]:
+    wanted = os.environ.get("VESTCL_TEST_DEVICES", "")
+    if wanted == "all":  # Clover lists GPUs that it can't compile for
+        return [info for info in runtime.devices() if info.platform != "Clover"]
+    return [runtime.select(selector.strip() or None) for selector in wanted.split(",")]
+
+
+def _mapped() -> list[tuple[str, str]]:
+    both, gpu = ("tile", "pixel"), ("pixel",)
+    return [(info.index, mapping) for info in _devices() for mapping in (both if info.kind == "CPU" else gpu)]
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)
+
+
+@pytest.fixture(params=[info.index for info in _devices()])
+def session(request: pytest.FixtureRequest) -> Iterator[runtime.Session]:
+    """Each device under test, with the mapping that suits it."""
+    with runtime.use(request.param) as opened:
+        yield opened
+
+
+@pytest.fixture(params=_mapped(), ids="-".join)
+def mapped_session(request: pytest.FixtureRequest) -> Iterator[runtime.Session]:
+    """Each device under test; a CPU with both mappings, so that it tests the GPUs' path too."""
+    with runtime.use(*request.param) as opened:
+        yield opened
+
+
+@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+def dtype(request: pytest.FixtureRequest) -> torch.dtype:
+    """Both precisions, on devices that have both."""
+    if request.param == torch.float64:
+        _need_float64(request)
+    return request.param
+
+
+@pytest.fixture
+def float64(request: pytest.FixtureRequest) -> torch.dtype:
+    """For gradcheck: only on devices that have float64."""
+    _need_float64(request)
+    return torch.float64
+
+
+def _need_float64(request: pytest.FixtureRequest) -> None:
+    name = "mapped_session" if "mapped_session" in request.fixturenames else "session"
+    info = request.getfixturevalue(name).info
+    if not info.float64:
+        pytest.skip(f"{info.name} has no float64")

@@ -1,0 +1,119 @@
+"""The command line, called as a function; only what must not be imported is tested in a child."""
+
+import subprocess
+import sys
+import types
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from vestcl import cli, doctor, runtime
+
+
+@pytest.fixture(autouse=True)
+def _wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.delenv("VESTCL_DEVICE", raising=False)
+
+
+def put_module(monkeypatch: pytest.MonkeyPatch, name: str, **members: object) -> None:
+    """A stand-in for module ``name``, wherever it is imported from."""
+    module = types.ModuleType(name)
+    vars(module).update(members)
+    monkeypatch.setitem(sys.modules, name, module)
+    package, _, stem = name.rpartition(".")
+    monkeypatch.setattr(sys.modules[package], stem, module, raising=False)
+
+
+def test_devices_marks_the_one_in_use(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for info in runtime.devices():
+        monkeypatch.setenv("VESTCL_DEVICE", info.index)
+        assert cli.main(["devices"]) == 0
+        table = capsys.readouterr().out
+        assert [line.split()[1] for line in table.splitlines() if line.startswith(" * ")] == [info.index]
+        assert info.name in table
+        assert info.platform in table
+
+
+def test_devices_is_quick() -> None:
+    code = "import sys; from vestcl import cli; cli.main(['devices']); sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_an_unknown_device_is_one_red_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VESTCL_DEVICE", "abacus")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert cli.main(["devices"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("\x1b[31merror: VESTCL_DEVICE or selector 'abacus' fits none of the OpenCL devices")
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == "vestcl 0.1.0\n"
+
+
+@pytest.mark.parametrize(("arguments", "code"), [("--help", 0), ("", 2), ("dance", 2), ("demo --seed x", 2)])
+def test_help_and_mistakes(arguments: str, code: int, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        cli.main(arguments.split())
+    assert caught.value.code == code
+    assert "Traceback" not in "".join(capsys.readouterr())
+
+
+def test_demo(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    put_module(
+        monkeypatch, "vestcl.demo", run=lambda *arguments: calls.append((*arguments, runtime.current().info.index))
+    )
+    last = runtime.devices()[-1].index
+    before = runtime.current()
+    assert cli.main(["demo"]) == 0
+    assert cli.main(["demo", "--out", "x", "--height", "8", "--width", "9", "--seed", "3", "--device", last]) == 0
+    assert calls == [(Path("out"), 256, 832, 0, before.info.index), (Path("x"), 8, 9, 3, last)]
+    assert runtime.current() is before
+
+
+def test_a_value_error_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def run(*_: object) -> None:
+        raise ValueError("`height` must be positive, got 0")
+
+    put_module(monkeypatch, "vestcl.demo", run=run)
+    assert cli.main(["demo", "--height", "0"]) == 2
+    assert capsys.readouterr().err == "error: `height` must be positive, got 0\n"
+
+
+def test_bench(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass(frozen=True)
+    class SplatBench:
+        """Time splat."""
+
+        points: int = 1000
+
+    configs = []
+    put_module(monkeypatch, "vestcl.bench")
+    put_module(monkeypatch, "vestcl.bench.splat", SplatBench=SplatBench, main=configs.append)
+    assert cli.main(["bench", "splat"]) == 0
+    assert cli.main(["bench", "splat", "--points", "5"]) == 0
+    assert configs == [SplatBench(1000), SplatBench(5)]
+    with pytest.raises(SystemExit):
+        cli.main(["bench"])
+
+
+def test_doctor_tells_what_works(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    info = runtime.select()
+    sound = doctor.DeviceReport(info, tuple(doctor.Step(name, True) for name in doctor.STEPS), ())
+    ill = doctor.DeviceReport(info, (doctor.Step("build", False, "no [ld]"),), ("build: no [ld]",))
+
+    monkeypatch.setattr(doctor, "examine", lambda timeout: doctor.Report((sound,), info.index, ()))
+    assert cli.main(["doctor"]) == 0
+    assert "vestcl's device works" in capsys.readouterr().out
+
+    monkeypatch.setattr(doctor, "examine", lambda timeout: doctor.Report((ill,), info.index, ("mend [it]",)))
+    assert cli.main(["doctor"]) == 1
+    out = capsys.readouterr().out
+    assert "vestcl's device does not work" in out
+    assert f"{info.index} build: no [ld]\nmend [it]\n" in out

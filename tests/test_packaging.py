@@ -1,0 +1,90 @@
+"""Kernels are found and build from a wheel, an editable install and a bare checkout, each in a path with a space."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+BUILD_A_KERNEL = """
+import numpy as np
+from vestcl import runtime
+runtime.current().kernel("splat_bin.cl", "count_tiles", runtime.defines_for(np.dtype(np.float32)))
+print(runtime.kernel_folder())
+"""
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `setup.py` needs of this repository, copied, so that pip's build folders don't litter it."""
+    folder = tmp_path_factory.mktemp("a clone") / "vestcl checkout"
+    no_caches = shutil.ignore_patterns("__pycache__")
+    for name in ("vestcl", "kernels", "tests", "train"):
+        shutil.copytree(ROOT / name, folder / name, ignore=no_caches)
+    for name in ("setup.py", "pyproject.toml", "LICENSE"):
+        shutil.copy(ROOT / name, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    pip(sys.executable, "wheel", str(checkout), "--wheel-dir", str(folder))
+    (file,) = folder.glob("vestcl-*.whl")
+    return file
+
+
+def pip(python: str, command: str, *arguments: str) -> None:
+    options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([sys.executable, "-m", "pip", "--python", python, command, *options, *arguments], check=True)
+
+
+def kernel_folder(python: str, path: Path | None, away: Path) -> Path:
+    """Where a child that is started in folder ``away`` finds the kernels, once it has built one."""
+    environment = {**os.environ, "PYTHONPATH": str(path or "")}
+    command = [python, "-c", BUILD_A_KERNEL]
+    done = subprocess.run(command, cwd=away, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+    return Path(done.stdout.strip())
+
+
+def files(folder: Path, *patterns: str) -> set[str]:
+    return {file.relative_to(folder).as_posix() for pattern in patterns for file in folder.rglob(pattern)}
+
+
+def test_the_wheel_holds_every_kernel_and_module_and_nothing_else(wheel: Path, checkout: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        shipped = {name for name in archive.namelist() if ".dist-info/" not in name}
+        entry_points = next(name for name in archive.namelist() if name.endswith("entry_points.txt"))
+        assert "vestcl = vestcl.cli:main" in archive.read(entry_points).decode()
+    kernels = {f"vestcl/kernels/{name}" for name in files(checkout / "kernels", "*.cl", "*.h")}
+    modules = {f"vestcl/{name}" for name in files(checkout / "vestcl", "*.py")}
+    assert kernels
+    assert shipped == kernels | modules
+
+
+def test_kernels_build_from_a_wheel(wheel: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site packages"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    assert kernel_folder(sys.executable, site, tmp_path) == site / "vestcl" / "kernels"
+
+
+def test_kernels_build_from_a_bare_checkout(checkout: Path, tmp_path: Path) -> None:
+    assert kernel_folder(sys.executable, checkout, tmp_path) == checkout / "kernels"
+
+
+def test_kernels_build_from_an_editable_install(checkout: Path, tmp_path: Path) -> None:
+    environment = tmp_path / "an environment"
+    venv.create(environment)
+    scheme = {"base": str(environment), "platbase": str(environment)}
+    site = Path(sysconfig.get_path("purelib", "venv", scheme))
+    (site / "outer.pth").write_text(sysconfig.get_path("purelib"))  # vestcl's dependencies, without its own .pth
+    python = str(environment / "bin" / "python")
+    pip(python, "install", "--editable", str(checkout))
+    assert kernel_folder(python, None, tmp_path) == checkout / "kernels"

@@ -1,0 +1,226 @@
+"""Devices, programs, launches and profiles, with kernels that a test writes into a folder of its own."""
+
+import contextvars
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vestcl import runtime
+
+SCALE = """
+kernel void scale(const REAL factor, global const REAL* in, global REAL* out)
+{
+  const int i = get_global_id(0);
+  out[i] = factor * in[i];
+}
+kernel void add_one(global const REAL* in, global REAL* out)
+{
+  out[get_global_id(0)] = in[get_global_id(0)] + 1;
+}
+"""
+
+
+@pytest.fixture(autouse=True)
+def _no_chosen_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("VESTCL_DEVICE", raising=False)
+
+
+@pytest.fixture
+def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A kernel folder with scale.cl, in place of vestcl's."""
+    (tmp_path / "scale.cl").write_text(SCALE)
+    monkeypatch.setattr(runtime, "kernel_folder", lambda: tmp_path)
+    monkeypatch.setattr(runtime, "source", runtime.source.__wrapped__)  # its cache knows file names alone
+    return tmp_path
+
+
+@pytest.fixture
+def fresh(session: runtime.Session) -> runtime.Session:
+    """A session of this test's own, in which nothing is built yet."""
+    return runtime.Session(session.info, session.mapping, session._device)
+
+
+def scale(session: runtime.Session, factor: float, array: np.ndarray) -> np.ndarray:
+    result = np.empty_like(array)
+    with session.job() as job:
+        arguments = [array.dtype.type(factor), job.read(array), job.write(result)]
+        job.launch("scale.cl", "scale", runtime.defines_for(array.dtype), array.shape, arguments)
+    return result
+
+
+# ---------------------------------------------------------------- devices
+
+
+def test_default_is_a_cpu_of_pocl() -> None:
+    info = runtime.select()
+    assert info.kind == "CPU"
+    assert "PoCL" in info.version
+
+
+def test_select_by_index_and_by_any_part_of_a_name() -> None:
+    for info in runtime.devices():
+        assert runtime.select(info.index) == info
+        assert info.platform == runtime.select(info.platform.upper()).platform
+        assert info.name == runtime.select(info.name[2:].lower()).name
+    assert "PoCL 3.0" in runtime.select("pocl 3.0").driver  # pip's, beside whichever the system has
+
+
+def test_select_by_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    last = runtime.devices()[-1]
+    monkeypatch.setenv("VESTCL_DEVICE", last.index)
+    assert runtime.select() == last
+    assert runtime.current().info == last
+    assert runtime.select(runtime.devices()[0].index) == runtime.devices()[0]  # an argument outweighs it
+
+
+@pytest.mark.parametrize("selector", ["no such device", "99:0"])
+def test_unknown_device_lists_those_that_there_are(selector: str) -> None:
+    with pytest.raises(runtime.DeviceError, match=selector) as caught:
+        runtime.select(selector)
+    for info in runtime.devices():
+        assert f"{info.index} {info.platform} / {info.name}" in str(caught.value)
+
+
+def test_no_device_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime, "devices", list)
+    with pytest.raises(runtime.DeviceError, match=r"pip install 'pyopencl\[pocl\]'"):
+        runtime.select()
+
+
+def test_use_holds_inside_a_with_block() -> None:
+    before = runtime.current()
+    last = runtime.devices()[-1].index
+    with runtime.use(last, mapping="pixel") as outer:
+        assert outer is runtime.current()
+        assert (outer.info.index, outer.mapping) == (last, "pixel")
+        with runtime.use(mapping="tile") as inner:
+            assert inner is runtime.current() is not outer
+        assert runtime.current() is outer
+    assert runtime.current() is before
+
+
+def test_use_sets_from_here_on() -> None:
+    def choose() -> str:
+        runtime.use(mapping="pixel")
+        return runtime.current().mapping
+
+    assert contextvars.copy_context().run(choose) == "pixel"
+    assert runtime.current().mapping == "tile"
+
+
+def test_use_checks_the_mapping() -> None:
+    with pytest.raises(ValueError, match="`mapping` must be 'tile', 'pixel' or None, got 'row'"):
+        runtime.use(mapping="row")
+
+
+def test_pocl_without_a_linker_names_the_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    info = runtime.select("pocl")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(runtime.DeviceError, match="apt install binutils"):
+        runtime.open_session.__wrapped__(info, "tile")
+
+
+# ---------------------------------------------------------------- programs
+
+
+def test_a_program_is_built_once(kernels: Path, fresh: runtime.Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    builds = []
+    build = fresh._build
+    monkeypatch.setattr(fresh, "_build", lambda *arguments: builds.append(arguments) or build(*arguments))
+    defines = runtime.defines_for(np.dtype(np.float32))
+    first = fresh.kernel("scale.cl", "scale", defines)
+    assert fresh.kernel("scale.cl", "scale", dict(reversed(defines.items()))) is first
+    assert fresh.kernel("scale.cl", "add_one", defines) is not first
+    assert len(builds) == 1
+    assert fresh.kernel("scale.cl", "scale", {**defines, "TILE": 8}) is not first
+    assert len(builds) == 2
+
+
+@pytest.mark.parametrize("broken", ["broken.cl", "part.h"])
+def test_a_build_error_points_to_file_and_line(kernels: Path, fresh: runtime.Session, broken: str) -> None:
+    lines = {"part.h": "#define PART 1\n", "broken.cl": '\n#include "part.h"\n\nkernel void nothing() {}\n'}
+    lines[broken] += "nonsense;\n"
+    for name, text in lines.items():
+        (kernels / name).write_text(text)
+    line = lines[broken].count("\n")
+    with pytest.raises(runtime.DeviceError, match=rf"(?s)broken.cl does not build on .*REAL=float.*{broken}:{line}:"):
+        fresh.kernel("broken.cl", "nothing", {"REAL": "float"})
+
+
+def test_float64_on_a_device_without_it(kernels: Path, fresh: runtime.Session) -> None:
+    fresh.info = dataclasses.replace(fresh.info, float64=False)
+    assert scale(fresh, 2, np.ones(3, np.float32)).tolist() == [2, 2, 2]
+    with pytest.raises(runtime.DeviceError, match="has no float64; pass float32"):
+        scale(fresh, 2, np.ones(3))
+
+
+def test_missing_kernels_name_the_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(runtime, "__file__", str(tmp_path / "vestcl" / "runtime.py"))
+    with pytest.raises(runtime.DeviceError, match="install the package again"):
+        runtime.kernel_folder.__wrapped__()
+
+
+def test_every_kernel_file_is_found_and_inlined() -> None:
+    for file in runtime.kernel_folder().glob("*.cl"):
+        assert '#include "' not in runtime.source(file.name)
+
+
+# ---------------------------------------------------------------- jobs
+
+
+def test_results_arrive(kernels: Path, fresh: runtime.Session) -> None:
+    array = np.arange(1000, dtype=np.float32)
+    np.testing.assert_array_equal(scale(fresh, 0.5, array), array / 2)
+    fresh.shares_host_memory = False  # copies, as for a GPU
+    np.testing.assert_array_equal(scale(fresh, 0.25, array), array / 4)
+
+
+def test_results_of_one_launch_feed_the_next(kernels: Path, fresh: runtime.Session) -> None:
+    array, result = np.arange(5, dtype=np.float32), np.empty(5, np.float32)
+    defines = runtime.defines_for(array.dtype)
+    with fresh.job() as job:
+        between = job.scratch(array.size, array.dtype)
+        job.launch("scale.cl", "scale", defines, array.shape, [np.float32(3), job.read(array), between])
+        job.launch("scale.cl", "add_one", defines, array.shape, [between, job.write(result)])
+        job.sync()
+        assert result.tolist() == [1, 4, 7, 10, 13]
+
+
+def test_a_cpu_reads_the_array_itself(kernels: Path, fresh: runtime.Session) -> None:
+    if fresh.info.kind != "CPU":
+        pytest.skip("this device has a memory of its own")
+    array, result = np.ones(8, np.float32), np.empty(8, np.float32)
+    with fresh.job() as job:
+        arguments = [np.float32(2), job.read(array), job.write(result)]
+        array[:] = 21  # after `read`: a copy would not see it
+        job.launch("scale.cl", "scale", runtime.defines_for(array.dtype), array.shape, arguments)
+    assert result.tolist() == [42] * 8
+
+
+def test_a_failed_job_frees_the_session(kernels: Path, fresh: runtime.Session) -> None:
+    with pytest.raises(KeyError), fresh.job() as job:
+        job.launch("scale.cl", "no_such_kernel", runtime.defines_for(np.dtype(np.float32)), (1,), [])
+    with ThreadPoolExecutor(1) as other:
+        assert other.submit(scale, fresh, 2, np.ones(1, np.float32)).result(timeout=60) == 2
+
+
+def test_threads_share_a_session(kernels: Path, fresh: runtime.Session) -> None:
+    array = np.arange(100, dtype=np.float32)
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(lambda factor: scale(fresh, factor, array), range(40)))
+    for factor, result in enumerate(results):
+        np.testing.assert_array_equal(result, factor * array)
+
+
+def test_profile_times_every_kernel(kernels: Path, fresh: runtime.Session) -> None:
+    array = np.ones(10_000, np.float32)
+    scale(fresh, 1, array)
+    with fresh.profile() as times:
+        scale(fresh, 2, array)
+        scale(fresh, 3, array)
+    scale(fresh, 4, array)
+    assert [time.name for time in times] == ["scale", "scale"]
+    assert all(0 < time.start_ns <= time.end_ns for time in times)

@@ -1,0 +1,6 @@
+"""Where frames come from: the procedural street, and later one reader a data set."""
+
+from vestcl.data.raycast import SKY_DEPTH, Frame, Label
+from vestcl.data.street import Street, intrinsics
+
+__all__ = ["SKY_DEPTH", "Frame", "Label", "Street", "intrinsics"]

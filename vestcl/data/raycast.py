@@ -1,0 +1,208 @@
+"""Launcher of the ray caster: solids seen by a pinhole camera, as colour, z-depth and Cityscapes train ids.
+
+A pixel's ray is s (R K^-1) (u, v, 1), scaled so that s is its z-depth; see kernels/raycast.cl.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vestcl import constants, runtime
+
+#: z-depth of the sky in metres: far enough that a metre's move shifts it by less than a pixel, and finite.
+SKY_DEPTH: Final = 1000.0
+
+#: Side of a cell of the shadow grid in metres: about a car, so that few shadows touch one.
+SHADOW_CELL: Final = 4.0
+
+#: Metres from the camera, to every side, within which shadows fall; beyond it the haze has washed them out.
+SHADOW_REACH: Final = 160.0
+
+#: Lists of solids are kept in 16 bits.
+MAX_SOLIDS: Final = 1 << 16
+
+
+class Shape(IntEnum):
+    """A solid's surface before it is scaled by half_size."""
+
+    BOX = 0
+    CYLINDER = 1
+    ELLIPSOID = 2
+
+
+class Material(IntEnum):
+    """How a solid's surface is painted."""
+
+    PLAIN = 0
+    PAVEMENT = 1
+    BRICK = 2
+    PLASTER = 3
+    ROOF = 4
+    CAR_BODY = 5
+    CAR_CABIN = 6
+    WHEEL = 7
+    BARK = 8
+    FOLIAGE = 9
+    CLOTH = 10
+    HEAD = 11
+    CAR_PANEL = 12
+
+
+class Label(IntEnum):
+    """The Cityscapes train ids that a street has."""
+
+    ROAD = 0
+    SIDEWALK = 1
+    BUILDING = 2
+    POLE = 5
+    VEGETATION = 8
+    SKY = 10
+    PERSON = 11
+    CAR = 13
+
+
+#: One solid, as kernels/raycast_types.h lays it out. Axes and metres as everywhere; tint is linear RGB.
+SOLID: Final = np.dtype(
+    [
+        ("centre", np.float32, 3),
+        ("half_size", np.float32, 3),
+        ("yaw", np.float32, 2),
+        ("taper", np.float32, 3),
+        ("tint", np.float32, 3),
+        ("shape", np.int32),
+        ("material", np.int32),
+        ("label", np.int32),
+        ("seed", np.uint32),
+    ]
+)
+
+_VIEW: Final = np.dtype(
+    [
+        ("ray", np.float32, (3, 3)),
+        ("project", np.float32, (3, 3)),
+        ("camera", np.float32, 3),
+        ("sun", np.float32, 3),
+        ("pixel", np.float32),
+        ("lane", np.float32),
+        ("kerb", np.float32),
+        ("grid", np.float32, 2),
+        ("seed", np.uint32),
+    ]
+)
+
+Solids = NDArray[np.void]
+"""An array [P] of dtype SOLID."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a camera sees."""
+
+    colour: NDArray[np.float32]
+    """[B,3,H,W], display RGB in [0, 1]."""
+    depth: NDArray[np.float32]
+    """[B,1,H,W], z-depth in metres; SKY_DEPTH where there is sky."""
+    labels: NDArray[np.uint8]
+    """[B,1,H,W], Cityscapes train ids, see `Label`."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything around one camera. Solids are placed from the camera, in world axes."""
+
+    solids: Solids
+    """[P], P > 0."""
+    crossings: NDArray[np.float32]
+    """[n,2], the world's z where side streets begin and end."""
+    sun: tuple[float, float, float]
+    """Unit vector towards it."""
+    lane: float
+    """From the centre line to the edge line, metres."""
+    kerb: float
+    """From the centre line to the kerb, metres."""
+    seed: int
+    """Of the road's and the sky's texture."""
+
+
+def blank_frame(batch: int, height: int, width: int) -> Frame:
+    """A `Frame` of ``batch`` images whose arrays are still to be written."""
+    return Frame(
+        np.empty((batch, 3, height, width), np.float32),
+        np.empty((batch, 1, height, width), np.float32),
+        np.empty((batch, 1, height, width), np.uint8),
+    )
+
+
+def cast(
+    scene: Scene, camera_from_world: NDArray[np.float64], K: NDArray[np.float64], frame: Frame, index: int
+) -> None:
+    """Fill image ``index`` of ``frame``.
+
+    Args:
+        scene: what there is, placed from this camera.
+        camera_from_world: [4,4], a rigid transform.
+        K: [3,3] intrinsics in pixels, last row (0, 0, 1).
+        frame: where the result goes, from `blank_frame`.
+        index: which image of the batch.
+    """
+    height, width = frame.depth.shape[2:]
+    count = len(scene.solids)
+    assert 0 < count <= MAX_SOLIDS and scene.solids.dtype == SOLID
+    tile = constants.TILE
+    tile_rows, tile_columns = -(-height // tile), -(-width // tile)
+    cells = int(2 * SHADOW_REACH / SHADOW_CELL)
+    crossings = scene.crossings if len(scene.crossings) else np.zeros((1, 2), np.float32)
+    inputs = (_view(scene, camera_from_world, K), scene.solids, crossings)
+    with runtime.current().job() as job:
+        view, solids, side_streets = (job.read(array) for array in inputs)
+        image_rects, shadow_rects = job.scratch(4 * count, np.int32), job.scratch(4 * count, np.int32)
+        tiles = [image_rects, *_lists(job, tile_rows * tile_columns, count)]
+        cell_lists = _lists(job, cells * cells, count)
+        sizes = _int32(height, width, cells, cells)
+        _launch(job, "project_solids", (count,), [*sizes, view, solids, image_rects, shadow_rects])
+        _launch(job, "list_solids", (tile_rows,), [*_int32(tile_columns, tile, count), *tiles])
+        _launch(job, "list_solids", (cells,), [*_int32(cells, 1, count), shadow_rects, *cell_lists])
+        sizes = _int32(height, width, tile_columns, count, len(scene.crossings), cells, cells)
+        outputs = [job.write(array[index]) for array in (frame.colour, frame.depth, frame.labels)]
+        arguments = [*sizes, view, solids, *tiles, *cell_lists, side_streets, *outputs]
+        _launch(job, "raycast", (tile_rows * tile_columns, tile), arguments, (1, tile))
+
+
+def _launch(
+    job: runtime.Job,
+    name: str,
+    global_size: tuple[int, ...],
+    arguments: list[runtime.Argument],
+    local_size: tuple[int, ...] | None = None,
+) -> None:
+    names = {f"{kind.__name__.upper()}_{m.name}": int(m) for kind in (Shape, Material, Label) for m in kind}
+    defines = runtime.defines_for(
+        np.dtype(np.float32), SKY_DEPTH=f"{SKY_DEPTH}f", SHADOW_CELL=f"{SHADOW_CELL}f", **names
+    )
+    job.launch("raycast.cl", name, defines, global_size, arguments, local_size)
+
+
+def _int32(*values: int) -> list[np.int32]:
+    return [np.int32(value) for value in values]
+
+
+def _lists(job: runtime.Job, cells: int, count: int) -> tuple[runtime.Argument, runtime.Argument]:
+    return job.scratch(cells * count, np.uint16), job.scratch(cells, np.int32)
+
+
+def _view(scene: Scene, camera_from_world: NDArray[np.float64], K: NDArray[np.float64]) -> NDArray[np.void]:
+    rotation, translation = camera_from_world[:3, :3], camera_from_world[:3, 3]
+    view = np.zeros(1, _VIEW)
+    view["ray"] = rotation.T @ np.linalg.inv(K)
+    view["project"] = K @ rotation
+    view["camera"] = -rotation.T @ translation
+    view["sun"] = scene.sun
+    view["pixel"] = 1 / K[0, 0]
+    view["lane"], view["kerb"] = scene.lane, scene.kerb
+    # The grid starts at a multiple of a cell in the world, lest shadows depend on where the camera is.
+    view["grid"] = -SHADOW_REACH - np.mod(view["camera"][0, [0, 2]], SHADOW_CELL)
+    view["seed"] = scene.seed
+    return view

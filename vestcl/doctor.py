@@ -1,0 +1,237 @@
+"""What works on each OpenCL device of this machine, and the remedy for what does not.
+
+A driver may kill the process that loads it, so every one is tried in a child: ``python -m vestcl.doctor list``
+enumerates the devices, ``python -m vestcl.doctor INDEX`` takes one device through `STEPS`. Children print one
+JSON object a line as they go; the parent reads how far they came.
+"""
+
+import dataclasses
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from vestcl import constants, pocl_cpu, runtime
+
+#: What a child tries on its device, in this order; the first failure ends it.
+STEPS: Final = ("build", "run", "float64", "splat")
+
+_VENDORS: Final = "/etc/OpenCL/vendors"
+_NO_POCL: Final = "no OpenCL device: pip install 'pyopencl[pocl]' brings one for the CPU"
+_NO_WORKING_POCL: Final = (
+    "no OpenCL device, though PoCL is installed: let POCL_CACHE_DIR (or else ~/.cache) be a folder that it can write "
+    "to, and unset what is set of POCL_DEVICES, OCL_ICD_VENDORS and OPENCL_VENDOR_PATH"
+)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step on one device."""
+
+    name: str
+    passed: bool
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class DeviceReport:
+    """One device: the steps that its child came through, the last one failed unless ``works``."""
+
+    info: runtime.DeviceInfo
+    steps: tuple[Step, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def works(self) -> bool:
+        """Whether vestcl can use the device. Lacking float64 is no fault: float32 remains."""
+        return len(self.steps) == len(STEPS) and all(s.passed or s.name == "float64" for s in self.steps)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Every device, the index of the one that vestcl would use, and what is wrong with the machine itself."""
+
+    devices: tuple[DeviceReport, ...]
+    default: str | None
+    notes: tuple[str, ...]
+
+    @property
+    def works(self) -> bool:
+        """Whether the default device works."""
+        return any(device.works for device in self.devices if device.info.index == self.default)
+
+
+def examine(timeout: float = 120.0) -> Report:
+    """Try every OpenCL device in a child process of its own.
+
+    Args:
+        timeout: seconds that each child may take.
+    """
+    listing = _run_child([sys.executable, "-m", "vestcl.doctor", "list"], timeout)
+    notes = list(_icd_notes(timeout))
+    if listing.ending:
+        notes.append(f"listing the devices failed: {listing.ending}")
+        notes.append(f"find the driver at fault: move the .icd files in {vendors()} away one by one")
+    infos = [runtime.DeviceInfo(**line["device"]) for line in listing.lines if "device" in line]
+    if not infos and not listing.ending:
+        notes.append(_NO_WORKING_POCL if importlib.util.find_spec("pocl_binary_distribution") else _NO_POCL)
+    notes += [line["error"] for line in listing.lines if infos and "error" in line]
+    if os.environ.get("RUSTICL_ENABLE") is None and any("rusticl" in library.lower() for _, library in _icds()):
+        notes.append("rusticl shows no device until it is told which: RUSTICL_ENABLE=llvmpipe, radeonsi, iris, ...")
+    default = next((line["default"] for line in listing.lines if "default" in line), None)
+    return Report(tuple(_examine_device(info, timeout) for info in infos), default, tuple(notes))
+
+
+def vendors() -> Path:
+    """The folder whose .icd files name the OpenCL drivers of this machine."""
+    return Path(os.environ.get("OCL_ICD_VENDORS") or os.environ.get("OPENCL_VENDOR_PATH") or _VENDORS)
+
+
+# ---------------------------------------------------------------- the parent
+
+
+@dataclass(frozen=True)
+class _Child:
+    """What a child printed, and how it ended if not well."""
+
+    lines: tuple[dict[str, Any], ...]
+    ending: str
+
+
+def _run_child(command: Sequence[str], timeout: float) -> _Child:
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=timeout, check=False)
+    except subprocess.TimeoutExpired as late:
+        output, ending = late.stdout or b"", f"did not end within {timeout:g} s"
+    else:
+        output, ending = done.stdout, _ending(done.returncode, done.stderr.decode(errors="replace"))
+    lines = [json.loads(line) for line in output.decode(errors="replace").splitlines() if line.startswith("{")]
+    return _Child(tuple(lines), ending)
+
+
+def _ending(code: int, errors: str) -> str:
+    said = [line.strip() for line in errors.splitlines() if line.strip()] or ["it said nothing"]
+    if code < 0:
+        return f"was killed by {signal.Signals(-code).name}: {' / '.join(said[-3:])}"
+    return said[-1] if code else ""
+
+
+def _examine_device(info: runtime.DeviceInfo, timeout: float) -> DeviceReport:
+    child = _run_child([sys.executable, "-m", "vestcl.doctor", info.index], timeout)
+    steps = [Step(**line) for line in child.lines]
+    if child.ending:
+        steps.append(Step(STEPS[min(len(steps), len(STEPS) - 1)], False, child.ending))
+    notes = [f"{step.name}: {step.detail}" for step in steps if step.detail]
+    if child.ending:
+        notes.append("update its driver, or choose another device with VESTCL_DEVICE")
+    if pocl_cpu.is_unnamed(info.driver, info.version):
+        name = pocl_cpu.host_key()
+        notes.append(
+            f"this PoCL does not know this CPU; vestcl has named it {name!r}, so that it can build"
+            if name
+            else "this PoCL does not know this CPU and cannot build: install PoCL 3.1 or later"
+        )
+    return DeviceReport(info, tuple(steps), tuple(notes))
+
+
+def _icds() -> list[tuple[Path, str]]:
+    """Each .icd file and the library that it names."""
+    folder = vendors()
+    if folder.is_file():  # the loader takes it for a driver then
+        return [(folder, str(folder))]
+    return [(file, file.read_text().strip()) for file in sorted(folder.glob("*.icd"))]
+
+
+def _icd_notes(timeout: float) -> Iterator[str]:
+    folder = vendors()
+    if not folder.exists() and str(folder) != _VENDORS:
+        yield f"OCL_ICD_VENDORS names {folder}, which does not exist, and so hides every driver: unset it"
+    for file, library in _icds():
+        child = _run_child([sys.executable, "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", library], timeout)
+        if child.ending:
+            yield f"{file} names {library}, which can't be loaded: {child.ending}"
+            if "intelocl" in library:
+                yield f"{file} must hold the full path of libintelocl.so; `pip show -f intel-opencl-rt` tells it"
+
+
+# ---------------------------------------------------------------- the children
+
+
+def _list_devices() -> None:
+    for info in runtime.devices():
+        _say(device=dataclasses.asdict(info))
+    try:
+        _say(default=runtime.select().index)
+    except runtime.DeviceError as error:
+        _say(error=str(error))
+
+
+def _try_device(index: str) -> None:
+    attempts: dict[str, Callable[[], str]] = {
+        "build": lambda: _build(index),
+        "run": lambda: _run(np.float32),
+        "float64": lambda: _run(np.float64),
+        "splat": _splat,
+    }
+    assert tuple(attempts) == STEPS
+    for name, attempt in attempts.items():
+        try:
+            fault = attempt()
+        except (runtime.DeviceError, ImportError) as error:
+            fault = str(error)
+        _say(name=name, passed=not fault, detail=fault)
+        if fault and name != "float64":
+            break
+
+
+def _build(index: str) -> str:
+    runtime.use(index)
+    runtime.current().kernel("splat_bin.cl", "count_tiles", runtime.defines_for(np.dtype(np.float32)))
+    return ""
+
+
+def _run(dtype: type[np.floating[Any]]) -> str:
+    """Count the points of two tiles side by side: two lie in the left one, one in the right one."""
+    points_uv = np.array([[3, 3], [8, 8], [24, 8]], dtype)
+    height, width = constants.TILE, 2 * constants.TILE
+    counts, spans = np.empty(2, np.int32), np.empty(1, np.int32)
+    with runtime.current().job() as job:
+        sizes = [np.int32(n) for n in (height, width, 1, 2)]
+        cloud_starts = job.read(np.array([0, len(points_uv)], np.int32))
+        z = radii = opacities = job.read(np.ones(len(points_uv), dtype))
+        inputs: list[runtime.Argument] = [*sizes, cloud_starts, job.read(points_uv), z, radii, opacities]
+        outputs = [job.scratch(len(points_uv), np.int32), job.write(counts), job.write(spans)]
+        job.launch("splat_bin.cl", "count_tiles", runtime.defines_for(np.dtype(dtype)), (1, 1), [*inputs, *outputs])
+    return "" if counts.tolist() == [2, 1] else f"wrong result: points in two tiles {counts.tolist()}, wanted [2, 1]"
+
+
+def _splat() -> str:
+    """One opaque point of radius 1.5 px in the middle of 3 x 3 pixels (SPEC section 2)."""
+    from vestcl.ops.splat import splat  # torch is slow to import
+
+    one = np.ones((1, 1), np.float32)
+    points_uv = np.full((1, 1, 2), 1.5, np.float32)
+    image, _ = splat(points_uv, one, 1.5 * one, one, one[..., None], 3, 3)
+    edge, corner = 5 / 9, 1 / 9
+    wanted = np.array([[corner, edge, corner], [edge, 1, edge], [corner, edge, corner]])
+    error = float(np.abs(np.asarray(image)[0, 0] - wanted).max())
+    return "" if error < 1e-6 else f"wrong result: off by {error:.2g}"
+
+
+def _say(**line: object) -> None:
+    print(json.dumps(line), flush=True)
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "list":
+        _list_devices()
+    else:
+        _try_device(sys.argv[1])

@@ -1,0 +1,224 @@
+"""Launches of compositing, forward and backward, in both mappings: a work-item a tile, or a work-item a pixel."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from vestcl import constants, runtime
+from vestcl.ops._splat_lists import Array, Geometry, TileLists, chunks_of
+
+#: Channels that a GPU's work-item keeps in registers; more are composited in groups.
+CHANNEL_GROUP: Final = 32
+_GROUP: Final = constants.TILE**2
+_TILES: Final = "splat_composite.cl"
+_PIXELS: Final = "splat_composite_pixels.cl"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which gradients `composite_backward` computes; the fields are the names of `splat`'s arguments."""
+
+    points_uv: bool
+    radii: bool
+    opacities: bool
+    features: bool
+    backgrounds: bool
+
+    def defines(self) -> dict[str, int]:
+        return {f"GRAD_{name.upper()}": int(wanted) for name, wanted in vars(self).items()}
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One feature set on a geometry: what compositing reads. ``finite`` comes from the forward."""
+
+    geometry: Geometry
+    lists: TileLists
+    features: Array
+    """[P, C]"""
+    backgrounds: Array
+    """[B, C]"""
+    min_transmittance: float
+
+    @property
+    def channels(self) -> int:
+        return int(self.features.shape[1])
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return self.features.dtype
+
+    @property
+    def pixels(self) -> bool:
+        return self.lists.session.mapping == "pixel"
+
+    @property
+    def channel_group(self) -> int:
+        return min(CHANNEL_GROUP, self.channels)
+
+    def defines(self) -> dict[str, str | int]:
+        own: dict[str, str | int] = {"CHANNELS": self.channels, "TRUNCATE": int(self.min_transmittance > 0)}
+        if self.pixels:
+            own["CHANNEL_GROUP"] = self.channel_group
+        else:
+            itemsize, line = self.dtype.itemsize, constants.CACHE_LINE
+            widths = (n for n in (16, 8, 4, 1) if n <= self.channels and n * itemsize <= line)
+            stream = self.lists.session.info.kind == "CPU" and self.channels * itemsize % line == 0
+            own |= {"VECTOR": next(widths), "STREAM": int(stream), "SEGMENT": constants.SEGMENT}
+        return runtime.defines_for(self.dtype, **own)
+
+    def scalars(self) -> list[np.generic]:
+        return [*self.geometry.sizes, self.dtype.type(self.min_transmittance)]
+
+
+def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
+    """Image [B, H, W, C] and coverage [B, H, W], and what the backward needs to know of features that aren't finite."""
+    geometry, lists = layer.geometry, layer.lists
+    image = runtime.empty((geometry.batch, geometry.height, geometry.width, layer.channels), layer.dtype)
+    coverage = runtime.empty(image.shape[:3], layer.dtype)
+    tiles = len(lists.tile_slots)
+    finite = np.ones(geometry.points if layer.pixels else tiles, np.int32)
+    with lists.session.job() as job:
+        features = _read(job, layer.features)
+        lists_read = [job.read(lists.tile_starts), lists.records]
+        shown = [job.write(image), job.write(coverage)]
+        if not layer.pixels:
+            job.launch(
+                _TILES, "composite_tiles", layer.defines(), (tiles,),
+                [*layer.scalars(), *lists_read, features, job.read(layer.backgrounds), *shown, job.write(finite)],
+            )  # fmt: skip
+            return image, coverage, finite
+        defines = layer.defines()
+        finite_written = job.write(finite) if geometry.points else job.scratch(1, np.int32)
+        if geometry.points:
+            count = np.int32(geometry.points)
+            job.launch(_PIXELS, "find_finite", defines, (geometry.points,), [count, features, finite_written])
+        job.launch(
+            _PIXELS, "composite_pixels", defines, (tiles * _GROUP, -(-layer.channels // layer.channel_group)),
+            [*layer.scalars(), *lists_read, finite_written, features, job.read(layer.backgrounds), *shown],
+            (_GROUP, 1),
+        )  # fmt: skip
+    return image, coverage, finite
+
+
+def composite_backward(
+    layer: Layer, finite: Array, grad_image: Array, grad_coverage: Array, wanted: Wanted
+) -> dict[str, Array]:
+    """The wanted gradients, by name.
+
+    Args:
+        layer: as in the forward.
+        finite: from the forward.
+        grad_image: [B, C, H, W] in any memory order; planes and channels-last are read in place.
+        grad_coverage: [B, H, W].
+        wanted: the gradients to compute.
+    """
+    geometry = layer.geometry
+    shapes = {
+        "features": layer.features.shape,
+        "points_uv": geometry.points_uv.shape,
+        "radii": geometry.radii.shape,
+        "opacities": geometry.opacities.shape,
+    }
+    grads = {name: runtime.empty(shape, layer.dtype) for name, shape in shapes.items() if getattr(wanted, name)}
+    defines = layer.defines() | wanted.defines()
+    per_tile_count = len(layer.lists.tile_slots) * layer.channels if wanted.backgrounds else 1
+    with layer.lists.session.job() as job:
+        none = job.scratch(1, layer.dtype)
+        outputs = [job.write(grads[name]) if name in grads and grads[name].size else none for name in shapes]
+        per_tile = job.scratch(per_tile_count, layer.dtype)
+        if geometry.points:
+            chunks = chunks_of(layer.lists.session, geometry.points, 1)
+            job.launch(
+                _PIXELS if layer.pixels else _TILES, "clear_gradients", defines, (chunks,),
+                [np.int32(geometry.points), layer.lists.places, *outputs],
+            )  # fmt: skip
+        launch = _launch_pixels_backward if layer.pixels else _launch_tiles_backward
+        launch(job, layer, defines, finite, grad_image, grad_coverage, outputs, per_tile)
+        if wanted.backgrounds:
+            grads["backgrounds"] = runtime.empty(layer.backgrounds.shape, layer.dtype)
+            job.launch(
+                _PIXELS if layer.pixels else _TILES, "sum_grad_backgrounds", defines,
+                (layer.channels, geometry.batch),
+                [np.int32(geometry.tiles), per_tile, job.write(grads["backgrounds"])],
+            )  # fmt: skip
+    return grads
+
+
+def _launch_tiles_backward(
+    job: runtime.Job, layer: Layer, defines: dict[str, str | int], finite: Array, grad_image: Array,
+    grad_coverage: Array, outputs: list[runtime.Buffer], per_tile: runtime.Buffer,
+) -> None:  # fmt: skip
+    geometry, lists = layer.geometry, layer.lists
+    strides, grad_image = _strides(grad_image)
+    # A segment but the last has room for less than one more footprint, which bounds their number.
+    segments = 1 + lists.tile_slots // (constants.SEGMENT - _GROUP)
+    checkpoint_starts = (np.cumsum(segments) - segments).astype(np.int32)
+    checkpoints = int(segments.sum()) if segments.max(initial=1) > 1 else 1
+    inputs = [
+        job.read(lists.tile_starts), lists.records, _read(job, layer.features),
+        *map(job.read, (layer.backgrounds, finite, grad_image, grad_coverage, checkpoint_starts)),
+        job.scratch(checkpoints * (constants.TILE + 1) ** 2, layer.dtype), job.scratch(checkpoints, np.int32),
+    ]  # fmt: skip
+    for phase, count in _phases(layer):
+        job.launch(
+            _TILES, "composite_tiles_backward", defines, count,
+            [*layer.scalars(), *phase, *strides, *inputs, *outputs, per_tile],
+        )  # fmt: skip
+
+
+def _launch_pixels_backward(
+    job: runtime.Job, layer: Layer, defines: dict[str, str | int], finite: Array, grad_image: Array,
+    grad_coverage: Array, outputs: list[runtime.Buffer], per_tile: runtime.Buffer,
+) -> None:  # fmt: skip
+    geometry, lists = layer.geometry, layer.lists
+    strides, grad_image = _strides(grad_image)
+    tiles = len(lists.tile_slots)
+    starts = job.read(np.cumsum(lists.tile_slots) - lists.tile_slots)
+    weights, slot_grads = (job.scratch(int(lists.tile_slots.sum()), layer.dtype) for _ in range(2))
+    transmittance = job.scratch(geometry.batch * geometry.height * geometry.width, layer.dtype)
+    grad = job.read(grad_image)
+    entries = [job.read(lists.tile_starts), lists.records, starts, lists.slot_starts]
+    job.launch(
+        _PIXELS, "composite_pixels_backward", defines, (tiles * _GROUP,),
+        [*layer.scalars(), *strides, *entries, _read(job, finite), _read(job, layer.features),
+         job.read(layer.backgrounds), grad, job.read(grad_coverage), weights, slot_grads, transmittance],
+        (_GROUP,),
+    )  # fmt: skip
+    for phase, (columns, rows, batch) in _phases(layer):
+        job.launch(
+            _PIXELS, "sum_slots", defines, (columns * _GROUP, rows, batch),
+            [*geometry.sizes, *phase, *strides, *entries, weights, slot_grads, grad, *outputs],
+            (_GROUP, 1, 1),
+        )  # fmt: skip
+    if defines["GRAD_BACKGROUNDS"]:
+        job.launch(
+            _PIXELS, "sum_tile_backgrounds", defines, (layer.channels, tiles),
+            [*geometry.sizes, *strides, transmittance, grad, per_tile],
+        )  # fmt: skip
+
+
+def _phases(layer: Layer) -> Iterator[tuple[list[np.int32], tuple[int, int, int]]]:
+    """Launches that together visit every tile; no two tiles of a launch share a point. (x0, y0, steps), grid."""
+    rows, columns = layer.geometry.grid
+    step_x, step_y = min(layer.lists.span, columns), min(layer.lists.span, rows)
+    for y in range(step_y):
+        for x in range(step_x):
+            grid = -(-(columns - x) // step_x), -(-(rows - y) // step_y), layer.geometry.batch
+            yield [np.int32(n) for n in (x, y, step_x, step_y)], grid
+
+
+def _read(job: runtime.Job, array: Array) -> runtime.Buffer:
+    """A kernel argument even where there are no points."""
+    return job.read(array) if array.size else job.scratch(1, array.dtype)
+
+
+def _strides(grad_image: Array) -> tuple[list[np.int64], Array]:
+    """Numbers between pixels and between channels, and an array over the same memory that a buffer can hold."""
+    _, channels, height, width = grad_image.shape
+    channels_last = grad_image.transpose(0, 2, 3, 1)
+    if channels_last.flags.c_contiguous:
+        return [np.int64(channels), np.int64(1)], channels_last
+    return [np.int64(1), np.int64(height * width)], np.ascontiguousarray(grad_image)

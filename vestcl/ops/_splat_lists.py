@@ -1,0 +1,157 @@
+"""Rasterisation: points sorted into depth-ordered tile lists on the device (kernels/splat_bin.cl)."""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from vestcl import constants, runtime
+
+Array = np.ndarray[Any, Any]
+
+#: Points that one GPU thread counts and lists: few, for a GPU needs many threads.
+GPU_CHUNK: Final = 256
+#: At most so many counters (chunks x tiles) are kept: 64 MiB.
+MAX_COUNTERS: Final = 1 << 24
+#: Chunks for each compute unit of a CPU, so that an uneven one does not hold up the others.
+CHUNKS_PER_UNIT: Final = 4
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """The points of all clouds, contiguous and of one dtype: points_uv [P, 2], z, radii, opacities [P]."""
+
+    points_uv: Array
+    z: Array
+    radii: Array
+    opacities: Array
+    cloud_starts: Array
+    """[B + 1] int32: cloud b owns points cloud_starts[b] up to cloud_starts[b + 1]."""
+    height: int
+    width: int
+
+    @property
+    def points(self) -> int:
+        return len(self.z)
+
+    @property
+    def batch(self) -> int:
+        return len(self.cloud_starts) - 1
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of tiles."""
+        return -(-self.height // constants.TILE), -(-self.width // constants.TILE)
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of one image."""
+        rows, columns = self.grid
+        return rows * columns
+
+    @property
+    def sizes(self) -> list[np.int32]:
+        """The first arguments of every kernel."""
+        return [np.int32(n) for n in (self.height, self.width, *self.grid)]
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Depth-sorted lists of every tile, on the device. E entries, one for each (point, tile) with a fragment."""
+
+    session: runtime.Session
+    tile_starts: Array
+    """[B * tiles + 1] int32."""
+    tile_slots: Array
+    """[B * tiles] int64: room that the backward needs, in pixels of all footprints inside the tile."""
+    span: int
+    """Most tiles that a footprint covers along an axis."""
+    records: runtime.Buffer
+    """[E] record_t of kernels/splat.h."""
+    places: runtime.Buffer
+    """[P] int32: the tiles of each point, see pack_place in kernels/splat.h."""
+    slot_starts: runtime.Buffer | None
+    """[E] int64: an entry's first slot in its tile; for the mapping "pixel"."""
+
+
+def chunks_of(session: runtime.Session, points: int, counters: int) -> int:
+    """Work-items that share ``points``, each with ``counters`` numbers of its own. No result depends on it."""
+    if session.mapping == "tile":
+        return CHUNKS_PER_UNIT * session.info.compute_units
+    return max(1, min(points // GPU_CHUNK, MAX_COUNTERS // counters))
+
+
+def list_tiles(session: runtime.Session, geometry: Geometry) -> TileLists:
+    """Count each chunk's points per tile, list them by tile in order of their index, sort each list by depth."""
+    defines = runtime.defines_for(geometry.z.dtype)
+    chunks = chunks_of(session, geometry.points // geometry.batch, geometry.tiles * geometry.batch)
+    spans = np.ones((geometry.batch, chunks), np.int32)
+    tile_counts = np.zeros(geometry.batch * geometry.tiles, np.int32)
+    with session.job() as job:
+        places = job.scratch(geometry.points, np.int32)
+        if geometry.points == 0:
+            return _sort(job, geometry, _starts(tile_counts), 1, places, None)
+        starts, points_uv, z, radii, opacities = (
+            job.read(array)
+            for array in (geometry.cloud_starts, geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
+        )
+        counts = job.scratch(geometry.batch * chunks * geometry.tiles, np.int32)
+        job.launch(
+            "splat_bin.cl", "count_tiles", defines, (chunks, geometry.batch),
+            [*geometry.sizes, starts, points_uv, z, radii, opacities, places, counts, job.write(spans)],
+        )  # fmt: skip
+        job.launch(
+            "splat_bin.cl", "scan_chunks", defines, (geometry.tiles, geometry.batch),
+            [np.int32(chunks), np.int32(geometry.tiles), counts, job.write(tile_counts)],
+        )  # fmt: skip
+        job.sync()
+        tile_starts = _starts(tile_counts)
+        entries = job.scratch(int(tile_starts[-1]), _entry_type(geometry))
+        job.launch(
+            "splat_bin.cl", "fill_tiles", defines, (chunks, geometry.batch),
+            [*geometry.sizes, starts, points_uv, z, radii, places, job.read(tile_starts), counts, entries],
+        )  # fmt: skip
+        return _sort(job, geometry, tile_starts, int(spans.max()), places, entries)
+
+
+def _starts(tile_counts: Array) -> Array:
+    starts = np.zeros(len(tile_counts) + 1, np.int64)
+    np.cumsum(tile_counts, out=starts[1:])
+    if starts[-1] >= 2**31:
+        raise ValueError(f"`radii` must make fewer than 2**31 pairs of a point and a tile, got {starts[-1]}")
+    return starts.astype(np.int32)
+
+
+def _entry_type(geometry: Geometry) -> np.dtype[Any]:
+    return np.dtype(f"V{2 * geometry.z.dtype.itemsize}")
+
+
+def _sort(
+    job: runtime.Job,
+    geometry: Geometry,
+    tile_starts: Array,
+    span: int,
+    places: runtime.Buffer,
+    entries: runtime.Buffer | None,
+) -> TileLists:
+    """Sort every tile's entries by (z, index) into records. Without points there is nothing to sort."""
+    count, tiles = int(tile_starts[-1]), len(tile_starts) - 1
+    together = job.session.mapping == "pixel"
+    records = job.scratch(count, np.dtype(f"V{6 * geometry.z.dtype.itemsize + 8}"))
+    slot_starts = job.scratch(count, np.int64) if together else None
+    tile_slots = np.zeros(tiles, np.int64)
+    if entries is not None and count:
+        arrays = (tile_starts, geometry.points_uv, geometry.radii, geometry.opacities)
+        arguments = [*geometry.sizes, *map(job.read, arrays), entries, job.scratch(count, _entry_type(geometry)),
+                     records, job.write(tile_slots)]  # fmt: skip
+        defines = runtime.defines_for(geometry.z.dtype)
+        if together:
+            group = constants.TILE**2
+            job.launch(
+                "splat_bin.cl", "sort_tiles_together", defines | {"TOGETHER": 1}, (tiles * group,),
+                [*arguments, slot_starts], (group,),
+            )  # fmt: skip
+        else:
+            job.launch("splat_bin.cl", "sort_tiles", defines, (tiles,), arguments)
+        job.sync()
+    return TileLists(job.session, tile_starts, tile_slots, span, records, places, slot_starts)

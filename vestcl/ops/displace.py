@@ -1,0 +1,114 @@
+"""Forward 3D displacement and projection into a camera (kernels/displace.cl)."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch.autograd.function import once_differentiable
+
+from vestcl import runtime
+from vestcl.ops._arguments import Array, as_array, check, require_no_grad, work_items
+
+
+def displace(
+    points_xyz: Array, displacement_xyz: Array, K: Array, tgt_from_src: Array | None = None
+) -> tuple[Array, Array]:
+    """(a, b, c) = K q,   uv = (a / c, b / c),   z = q_z   with q = tgt_from_src (x + u).
+
+    Nothing is clipped: a point behind the camera is projected through it. Where uv is not finite (c = 0, or a NaN
+    came in), uv has no gradient.
+
+    Args:
+        points_xyz: [B, N, 3] m in the source frame. Torch CPU tensor or NumPy array, float32 or float64.
+        displacement_xyz: [B, N, 3] m in the source frame. This and the others are of the same kind and dtype.
+        K: [B, 3, 3] px, of the target camera.
+        tgt_from_src: [B, 4, 4], last row (0, 0, 0, 1); None is the identity.
+
+    Returns:
+        points_uv [B, N, 2] px and z [B, N] m in the target camera, of the kind and dtype that came in; both
+        differentiable in ``points_xyz`` and ``displacement_xyz``.
+
+    Raises:
+        ValueError: an argument of another kind, dtype or shape, or a camera that requires grad.
+        DeviceError: no OpenCL device, or one without float64 where that is asked for.
+
+    Source: SPEC section 2; the forward 3D displacement of the paper.
+    """
+    check(
+        points_xyz=(points_xyz, "B N 3"),
+        displacement_xyz=(displacement_xyz, "B N 3"),
+        K=(K, "B 3 3"),
+        tgt_from_src=(tgt_from_src, "B 4 4 | None"),
+    )
+    projection = _projection(as_array(K), None if tgt_from_src is None else as_array(tgt_from_src))
+    if not isinstance(points_xyz, torch.Tensor):
+        return _forward(runtime.current(), as_array(points_xyz), as_array(displacement_xyz), projection)
+    require_no_grad("K", K)
+    require_no_grad("tgt_from_src", tgt_from_src)
+    return _Displace.apply(points_xyz, displacement_xyz, projection)
+
+
+class _Displace(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, points_xyz: torch.Tensor, displacement_xyz: torch.Tensor, projection: np.ndarray
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        ctx.session, ctx.projection = runtime.current(), projection
+        ctx.save_for_backward(points_xyz, displacement_xyz)
+        points_uv, z = _forward(ctx.session, as_array(points_xyz), as_array(displacement_xyz), projection)
+        return torch.from_numpy(points_uv), torch.from_numpy(z)
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, grad_points_uv: torch.Tensor, grad_z: torch.Tensor
+    ) -> tuple[torch.Tensor | None, torch.Tensor | None, None]:
+        points_needed, displacement_needed, _ = ctx.needs_input_grad
+        points_xyz, displacement_xyz = (as_array(saved) for saved in ctx.saved_tensors)
+        gradients = as_array(grad_points_uv), as_array(grad_z)
+        grad_xyz = torch.from_numpy(_backward(ctx.session, points_xyz, displacement_xyz, ctx.projection, *gradients))
+        return grad_xyz if points_needed else None, grad_xyz if displacement_needed else None, None
+
+
+def _projection(K: np.ndarray, tgt_from_src: np.ndarray | None) -> np.ndarray:
+    """[B, 4, 4]: K [R|t] and below it the z-row of [R|t], computed in float64 and rounded once."""
+    rigid = np.eye(3, 4)[None].repeat(len(K), 0) if tgt_from_src is None else tgt_from_src[:, :3].astype(np.float64)
+    return np.concatenate([K.astype(np.float64) @ rigid, rigid[:, 2:]], axis=1).astype(K.dtype)
+
+
+def _forward(
+    session: runtime.Session, points_xyz: np.ndarray, displacement_xyz: np.ndarray, projection: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    batch, count, _ = points_xyz.shape
+    points_uv = np.empty((batch, count, 2), points_xyz.dtype)
+    z = np.empty((batch, count), points_xyz.dtype)
+    if z.size:
+        chunk, items, group = work_items(session, count)
+        with session.job() as job:
+            inputs = [job.read(array) for array in (points_xyz, displacement_xyz, projection)]
+            arguments: list[runtime.Argument] = [np.int32(count), chunk, *inputs, job.write(points_uv), job.write(z)]
+            defines = runtime.defines_for(z.dtype)
+            job.launch("displace.cl", "displace", defines, (items, batch), arguments, (group, 1))
+    return points_uv, z
+
+
+def _backward(
+    session: runtime.Session,
+    points_xyz: np.ndarray,
+    displacement_xyz: np.ndarray,
+    projection: np.ndarray,
+    grad_points_uv: np.ndarray,
+    grad_z: np.ndarray,
+) -> np.ndarray:
+    """The gradient of the points, which is that of the displacement too."""
+    batch, count, _ = points_xyz.shape
+    grad_xyz = np.empty_like(points_xyz)
+    if grad_xyz.size:
+        chunk, items, group = work_items(session, count)
+        with session.job() as job:
+            arrays = points_xyz, displacement_xyz, projection, grad_points_uv, grad_z
+            inputs = [job.read(array) for array in arrays]
+            arguments: list[runtime.Argument] = [np.int32(count), chunk, *inputs, job.write(grad_xyz)]
+            defines = runtime.defines_for(grad_xyz.dtype)
+            job.launch("displace.cl", "displace_backward", defines, (items, batch), arguments, (group, 1))
+    return grad_xyz

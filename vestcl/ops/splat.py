@@ -1,0 +1,218 @@
+"""Depth-sorted alpha splatting: rasterise a geometry once, composite any number of feature sets on it."""
+
+from dataclasses import dataclass
+from typing import Any, Generic
+
+import numpy as np
+import torch
+from torch.autograd.function import once_differentiable
+
+from vestcl import constants, runtime
+from vestcl.ops._arguments import Array, as_array, check, check_starts, require_no_grad
+from vestcl.ops._splat_composite import Layer, Wanted, composite_backward, composite_forward
+from vestcl.ops._splat_lists import Geometry, TileLists, list_tiles
+
+
+@dataclass(frozen=True, eq=False)
+class Raster(Generic[Array]):
+    """A rasterised geometry, from `rasterize`; `composite` shows features on it. Its lists live on the device."""
+
+    points_uv: Array
+    radii: Array
+    opacities: Array
+    packed: bool
+    """Whether clouds are packed one after another (``cloud_starts`` was given)."""
+    geometry: Geometry
+    lists: TileLists
+
+    @property
+    def height(self) -> int:
+        return self.geometry.height
+
+    @property
+    def width(self) -> int:
+        return self.geometry.width
+
+
+def splat(
+    points_uv: Array,
+    z: Array,
+    radii: Array,
+    opacities: Array,
+    features: Array,
+    height: int,
+    width: int,
+    backgrounds: Array | None = None,
+    min_transmittance: float = 0.0,
+    *,
+    cloud_starts: Array | None = None,
+) -> tuple[Array, Array]:
+    """Composite the points of each cloud front to back onto its image.
+
+        d2 = |p - uv_i|^2,   a_i = o_i (1 - d2 / r_i^2)   at pixel centre p, for every point with d2 < r_i^2
+        T_0 = 1,   w_i = a_i T_i,   T_(i+1) = T_i (1 - a_i)   in the order (z, index)
+        image = sum_i w_i f_i + T_end b,   coverage = 1 - T_end
+
+    Exact: any number of fragments a pixel, no epsilon, no division by 1 - a in the gradient, the same bits on any
+    number of cores. Points with z < 0.1 m, a radius <= 0 or any number that is not finite (a feature counts) are
+    skipped, and their gradients are 0.
+
+    Clouds of different sizes cost no padding when they are packed: concatenate the points of all clouds (without the
+    leading B), and say in ``cloud_starts`` where each begins. Dense clouds padded with points of radius 0 work too; a
+    padded point is read once and then costs nothing.
+
+    Args:
+        points_uv: [B, N, 2] px, pixel centres at (column + 0.5, row + 0.5). Torch CPU tensor or NumPy array of
+            float32 or float64, any strides; the others are of the same kind and dtype.
+        z: [B, N] m, z-depth, for the order alone.
+        radii: [B, N] px.
+        opacities: [B, N], meant to be in [0, 1]; the formula is used as it stands outside.
+        features: [B, N, C], 1 <= C <= 1024.
+        height: rows of the image.
+        width: columns of the image.
+        backgrounds: [B, C]; None is zero.
+        min_transmittance: in [0, 1): a pixel takes no more fragments once its T is below this, which changes it by
+            at most min_transmittance * max |f - b|; the gradient is that of the truncated sum. 0 never stops.
+        cloud_starts: int64 [B + 1]; given, cloud b owns points cloud_starts[b]:cloud_starts[b + 1] of points_uv
+            [P, 2], z, radii, opacities [P] and features [P, C].
+
+    Returns:
+        image [B, C, H, W] in channels-last memory (what a torch convolution on a CPU likes best) and coverage
+        [B, 1, H, W], of the kind and dtype that came in; differentiable in all but z.
+
+    Raises:
+        ValueError: an argument of another kind, dtype, shape or device, or a ``z`` that requires grad (pass
+            z.detach(): the order of points has no gradient).
+        DeviceError: no OpenCL device, or one without float64 where that is asked for.
+
+    Source: SPEC section 2; the footprint is 3D Moments' (CVPR 2022), without its limit on fragments per pixel.
+    """
+    raster = rasterize(points_uv, z, radii, opacities, height, width, cloud_starts=cloud_starts)
+    return composite(raster, features, backgrounds, min_transmittance)
+
+
+def rasterize(
+    points_uv: Array,
+    z: Array,
+    radii: Array,
+    opacities: Array,
+    height: int,
+    width: int,
+    *,
+    cloud_starts: Array | None = None,
+) -> Raster[Array]:
+    """The geometric half of `splat`, for several feature sets on one geometry: depth-sorted lists of points per tile.
+
+    Args and raises as in `splat`. Gradients flow through `composite` into the arguments given here.
+
+    Returns:
+        A `Raster`. It holds device memory (about 32 bytes for each point and tile that it touches, in float32) and a
+        copy of the numbers: changing the arguments in place afterwards does not change it.
+    """
+    require_no_grad("z", z)
+    letters = "B N" if cloud_starts is None else "P"
+    sizes = check(
+        points_uv=(points_uv, f"{letters} 2"),
+        z=(z, letters),
+        radii=(radii, letters),
+        opacities=(opacities, letters),
+    )
+    if cloud_starts is None:
+        starts = np.arange(sizes["B"] + 1, dtype=np.int64) * sizes["N"]
+    else:
+        starts = check_starts("cloud_starts", cloud_starts, points_uv, sizes["P"])
+    if starts[-1] >= 2**31:
+        raise ValueError(f"`points_uv` must hold fewer than 2**31 points, got {starts[-1]}")
+    geometry = Geometry(
+        as_array(points_uv).reshape(-1, 2),
+        *(as_array(array).reshape(-1) for array in (z, radii, opacities)),
+        starts.astype(np.int32),
+        _size("height", height),
+        _size("width", width),
+    )
+    lists = list_tiles(runtime.current(), geometry)
+    return Raster(points_uv, radii, opacities, cloud_starts is not None, geometry, lists)
+
+
+def composite(
+    raster: Raster[Array], features: Array, backgrounds: Array | None = None, min_transmittance: float = 0.0
+) -> tuple[Array, Array]:
+    """The other half of `splat`: show ``features`` [B, N, C] (packed: [P, C]) on a rasterised geometry.
+
+    Args, returns and raises as in `splat`.
+    """
+    letters = "P C" if raster.packed else "B N C"
+    check(
+        **{
+            "raster.points_uv": (raster.points_uv, letters.replace("C", "2")),
+            "features": (features, letters),
+            "backgrounds": (backgrounds, f"{raster.geometry.batch} {features.shape[-1]}"),
+        }
+    )
+    if not 1 <= features.shape[-1] <= constants.MAX_CHANNELS:
+        raise ValueError(f"`features` must have 1 to {constants.MAX_CHANNELS} channels, got {features.shape[-1]}")
+    if not 0 <= min_transmittance < 1:
+        raise ValueError(f"`min_transmittance` must be in [0, 1), got {min_transmittance}")
+    if not isinstance(features, torch.Tensor):
+        image, coverage, _ = composite_forward(_layer(raster, features, backgrounds, min_transmittance))
+        return image.transpose(0, 3, 1, 2), coverage[:, None]
+    return _Composite.apply(
+        raster, min_transmittance, raster.points_uv, raster.radii, raster.opacities, features, backgrounds
+    )
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        raster: Raster[torch.Tensor],
+        min_transmittance: float,
+        points_uv: torch.Tensor,
+        radii: torch.Tensor,
+        opacities: torch.Tensor,
+        features: torch.Tensor,
+        backgrounds: torch.Tensor | None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        image, coverage, ctx.finite = composite_forward(_layer(raster, features, backgrounds, min_transmittance))
+        ctx.raster, ctx.min_transmittance = raster, min_transmittance
+        ctx.shapes = {"points_uv": points_uv.shape, "radii": radii.shape, "opacities": opacities.shape}
+        ctx.save_for_backward(features, backgrounds)
+        ctx.set_materialize_grads(False)
+        return torch.from_numpy(image).permute(0, 3, 1, 2), torch.from_numpy(coverage)[:, None]
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, grad_image: torch.Tensor | None, grad_coverage: torch.Tensor | None
+    ) -> tuple[torch.Tensor | None, ...]:
+        features, backgrounds = ctx.saved_tensors
+        layer = _layer(ctx.raster, features, backgrounds, ctx.min_transmittance)
+        size = (layer.geometry.batch, layer.channels, layer.geometry.height, layer.geometry.width)
+        if grad_image is None:
+            grad_image = features.new_zeros(size)
+        if grad_coverage is None:
+            grad_coverage = features.new_zeros((size[0], *size[2:]))
+        names = ("points_uv", "radii", "opacities", "features", "backgrounds")
+        wanted = Wanted(**dict(zip(names, ctx.needs_input_grad[2:], strict=True)))
+        grads = composite_backward(layer, ctx.finite, grad_image.numpy(), as_array(grad_coverage), wanted)
+        shapes = {**ctx.shapes, "features": features.shape}
+        tensors = (torch.from_numpy(grads[name]) if name in grads else None for name in names)
+        shaped = (t if t is None else t.reshape(shapes.get(n, t.shape)) for n, t in zip(names, tensors, strict=True))
+        return None, None, *shaped
+
+
+def _layer(
+    raster: Raster[Any], features: Array, backgrounds: Array | None, min_transmittance: float
+) -> Layer:
+    rows = as_array(features).reshape(-1, features.shape[-1])
+    if backgrounds is None:
+        behind = np.zeros((raster.geometry.batch, rows.shape[1]), rows.dtype)
+    else:
+        behind = as_array(backgrounds)
+    return Layer(raster.geometry, raster.lists, rows, behind, min_transmittance)
+
+
+def _size(name: str, value: int) -> int:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+        raise ValueError(f"`{name}` must be a whole number of pixels >= 1, got {value!r}")
+    return int(value)
