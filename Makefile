@@ -8,7 +8,7 @@ OUT ?= out
 
 venv: .venv/.installed
 
-# torch comes first and alone: its exact version decides between a build for the CPU and gigabytes of CUDA.
+# torch comes first and by its exact version: a CPU build (+cpu) that pip is pointed to satisfies it; PyPI's has CUDA.
 .venv/.installed: setup.py constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --constraint constraints.txt setuptools torch

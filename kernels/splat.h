@@ -27,32 +27,22 @@ inline box_t unpack_box(int packed) {
 }
 inline bool is_whole(int packed) { return packed >> 20; }
 
-// The indices of the pixels in [0, size) whose centres lie in (low, high) are [first_pixel(low), end_pixel(high)).
-inline int first_pixel(REAL low, int size) {
-  low -= (REAL)0.5 + SLACK;
-  low = low > 0 ? low : 0;
-  low = low < size ? low : size;
-  const int whole = (int)low;
-  return whole + (low > whole);
-}
-
-inline int end_pixel(REAL high, int size) {
-  high += (REAL)0.5 + SLACK;
-  high = high > 0 ? high : 0;
-  high = high < size ? high : size;
-  return (int)high;
-}
-
+// Pixels of an image whose centres (x + 0.5, y + 0.5) lie in the square of half side r about (u, v).
 inline box_t footprint(REAL u, REAL v, REAL r, int height, int width) {
-  const box_t box = {
-      first_pixel(u - r, width), first_pixel(v - r, height), end_pixel(u + r, width), end_pixel(v + r, height)};
+  const REAL half_pixel = (REAL)0.5 + SLACK;
+  const REAL4 size = (REAL4)(width, height, width, height);
+  REAL4 edge = (REAL4)(u - r - half_pixel, v - r - half_pixel, u + r + half_pixel, v + r + half_pixel);
+  edge = edge > 0 ? edge : (REAL4)0;
+  edge = edge < size ? edge : size;
+  const int4 whole = convert_int4(edge);
+  const box_t box = {whole.x + (edge.x > whole.x), whole.y + (edge.y > whole.y), whole.z, whole.w};
   return box;
 }
 
 inline int area_of(box_t box) { return (box.x1 - box.x0) * (box.y1 - box.y0); }
 
 // Quads (2 x 2 pixels) that cover a footprint, from its first pixel on.
-inline int quads_in(box_t box) { return (box.x1 - box.x0 + 1) / 2 * ((box.y1 - box.y0 + 1) / 2); }
+inline int quads_in(box_t box) { return ((box.x1 - box.x0 + 1) >> 1) * ((box.y1 - box.y0 + 1) >> 1); }
 
 // Whether a point can make fragments: all its numbers finite, not in front of the near plane, some radius.
 inline bool drawable(REAL u, REAL v, REAL z, REAL r, REAL o) {
@@ -60,10 +50,11 @@ inline bool drawable(REAL u, REAL v, REAL z, REAL r, REAL o) {
 }
 
 // Where a point's fragments are, as a number: its first tile, and how many rows and columns of tiles it has more.
-// -1: nowhere. Three more or above: count them again from the footprint.
+// -1: nowhere. MANY stands for MANY and above; the footprint then tells.
 #define MORE_BITS 2
 #define MANY ((1 << MORE_BITS) - 1)
 inline int pack_place(int tile, int more_rows, int more_columns) {
   return tile << 2 * MORE_BITS | min(more_rows, MANY) << MORE_BITS | min(more_columns, MANY);
 }
+inline int first_tile(int place) { return place >> 2 * MORE_BITS; }
 inline bool is_in_one_tile(int place) { return place >= 0 && (place & ((1 << 2 * MORE_BITS) - 1)) == 0; }

@@ -1,8 +1,37 @@
-// From points to depth-sorted tile lists, without atomics.
+// From points to depth-sorted tile lists, without atomics, so that every run makes the same lists.
+//
+// 1. count_tiles   One work-item walks a chunk of points, in order, and counts how many reach each tile.
+// 2. scan_chunks   For each tile, the counts become where each chunk starts in the tile's list.
+//                  (The host sums the tiles' totals, for it has to allocate the lists.)
+// 3. fill_tiles    Each chunk writes its points from there on: every list is in the order of the index.
+// 4. sort_tiles    Each list is sorted by z. The sort is stable, so equal depths stay in the order of the index, and
+//                  what compositing needs of each point is gathered into the list, to be read in sequence.
+//
+//   TOGETHER   defined: sort_tiles_together, a work-group a tile (for GPUs), instead of sort_tiles, a work-item a tile
 #include "common.h"
 #include "splat.h"
 
+// Points whose tiles are found at a time, in a loop that compilers turn into vector code.
 #define STRIP 128
+
+typedef struct { int begin, end; } range_t;
+
+// The points of chunk c of cloud b.
+inline range_t chunk_of(global const int* cloud_starts, int c, int chunks, int b) {
+  const int first = cloud_starts[b];
+  const long points = cloud_starts[b + 1] - first;
+  const range_t chunk = {first + (int)(points * c / chunks), first + (int)(points * (c + 1) / chunks)};
+  return chunk;
+}
+
+// How many rows and columns of tiles a point has more than one. x: columns, y: rows.
+inline int2 more_tiles(
+    int place, int i, int height, int width, global const REAL* points_uv, global const REAL* radii) {
+  const int2 more = (int2)(place & MANY, (place >> MORE_BITS) & MANY);
+  if (more.x < MANY && more.y < MANY) return more;
+  const box_t box = footprint(points_uv[2 * (size_t)i], points_uv[2 * (size_t)i + 1], radii[i], height, width);
+  return (int2)((box.x1 - 1) / TILE - box.x0 / TILE, (box.y1 - 1) / TILE - box.y0 / TILE);
+}
 
 kernel void count_tiles(
     const int height, const int width, const int tiles_y, const int tiles_x,
@@ -11,53 +40,43 @@ kernel void count_tiles(
     global const REAL* restrict z,            // [P]
     global const REAL* restrict radii,        // [P]
     global const REAL* restrict opacities,    // [P]
-    global int* restrict places,              // [P] out
+    global int* restrict places,              // [P] out: see pack_place
     global int* restrict counts,              // [B, chunks, tiles] out
-    global int* restrict spans)               // [B, chunks] out: most tiles a footprint covers along an axis
+    global int* restrict spans)               // [B, chunks] out: most tiles that a footprint covers along an axis
 {
-  const int c = get_global_id(0), b = get_global_id(1), chunks = get_global_size(0);
+  const int c = get_global_id(0), chunks = get_global_size(0), b = get_global_id(1);
   const int tiles = tiles_y * tiles_x;
-  const int points = cloud_starts[b + 1] - cloud_starts[b];
-  const int begin = cloud_starts[b] + (int)((long)points * c / chunks);
-  const int end = cloud_starts[b] + (int)((long)points * (c + 1) / chunks);
+  const range_t chunk = chunk_of(cloud_starts, c, chunks, b);
   global int* mine = counts + ((size_t)b * chunks + c) * tiles;
   for (int t = 0; t < tiles; t++) mine[t] = 0;
   int span = 1;
-  for (int strip = begin; strip < end; strip += STRIP) {
-    const int stop = min(strip + STRIP, end);
-    for (int i = strip; i < stop; i++) {
+  for (int strip = chunk.begin; strip < chunk.end; strip += STRIP) {
+    const int end = min(strip + STRIP, chunk.end);
+    for (int i = strip; i < end; i++) {
       const REAL u = points_uv[2 * (size_t)i], v = points_uv[2 * (size_t)i + 1];
       const box_t box = footprint(u, v, radii[i], height, width);
-      const bool some = drawable(u, v, z[i], radii[i], opacities[i]) & (box.x0 < box.x1) & (box.y0 < box.y1);
-      const int tx = box.x0 / TILE, ty = box.y0 / TILE;
-      const int columns = (box.x1 - 1) / TILE - tx, rows = (box.y1 - 1) / TILE - ty;
-      const int s = some ? max(columns, rows) : 0;
-      span = max(span, s + 1);
-      places[i] = some ? pack_place(ty * tiles_x + tx, rows, columns) : -1;
+      const bool seen = drawable(u, v, z[i], radii[i], opacities[i]) & (box.x0 < box.x1) & (box.y0 < box.y1);
+      const int x = box.x0 / TILE, y = box.y0 / TILE;
+      const int columns = (box.x1 - 1) / TILE - x, rows = (box.y1 - 1) / TILE - y;
+      span = max(span, seen ? max(columns, rows) + 1 : 1);
+      places[i] = seen ? pack_place(y * tiles_x + x, rows, columns) : -1;
     }
-    for (int i = strip; i < stop; i++) {
+    for (int i = strip; i < end; i++) {
       const int place = places[i];
       if (place < 0) continue;
-      int columns = place & MANY, rows = place >> MORE_BITS & MANY;
-      const int first = place >> 2 * MORE_BITS;
-      if (!(columns | rows)) { mine[first]++; continue; }
-      if (columns == MANY || rows == MANY) {
-        const box_t box = footprint(points_uv[2 * (size_t)i], points_uv[2 * (size_t)i + 1], radii[i], height, width);
-        columns = (box.x1 - 1) / TILE - box.x0 / TILE;
-        rows = (box.y1 - 1) / TILE - box.y0 / TILE;
-      }
-      for (int y = 0; y <= rows; y++)
-        for (int x = 0; x <= columns; x++) mine[first + y * tiles_x + x]++;
+      const int2 more = more_tiles(place, i, height, width, points_uv, radii);
+      for (int y = 0; y <= more.y; y++)
+        for (int x = 0; x <= more.x; x++) mine[first_tile(place) + y * tiles_x + x]++;
     }
   }
   spans[b * chunks + c] = span;
 }
 
-// One work-item a tile (t, b): its counts become where each chunk starts within the tile.
+// One work-item a tile.
 kernel void scan_chunks(
     const int chunks, const int tiles,
-    global int* restrict counts,        // [B, chunks, tiles] in, exclusive sums over chunks out
-    global int* restrict tile_counts)   // [B, tiles] out
+    global int* restrict counts,       // [B, chunks, tiles] in; out: the sums over the chunks before
+    global int* restrict tile_counts)  // [B, tiles] out
 {
   const int t = get_global_id(0), b = get_global_id(1);
   int sum = 0;
@@ -78,57 +97,22 @@ kernel void fill_tiles(
     global const REAL* restrict radii,        // [P]
     global const int* restrict places,        // [P]
     global const int* restrict tile_starts,   // [B * tiles + 1]
-    global int* restrict counts,              // [B, chunks, tiles] in: cursors; used up
+    global int* restrict counts,              // [B, chunks, tiles] in, used up: from where in the list each chunk writes
     global entry_t* restrict entries)         // [E] out
 {
-  const int c = get_global_id(0), b = get_global_id(1), chunks = get_global_size(0);
+  const int c = get_global_id(0), chunks = get_global_size(0), b = get_global_id(1);
   const int tiles = tiles_y * tiles_x;
-  const int points = cloud_starts[b + 1] - cloud_starts[b];
-  const int begin = cloud_starts[b] + (int)((long)points * c / chunks);
-  const int end = cloud_starts[b] + (int)((long)points * (c + 1) / chunks);
-  global int* mine = counts + ((size_t)b * chunks + c) * tiles;
-  global const int* starts = tile_starts + b * tiles;
-  for (int t = 0; t < tiles; t++) mine[t] += starts[t];
-  for (int i = begin; i < end; i++) {
+  const range_t chunk = chunk_of(cloud_starts, c, chunks, b);
+  global int* next = counts + ((size_t)b * chunks + c) * tiles;
+  for (int t = 0; t < tiles; t++) next[t] += tile_starts[b * tiles + t];
+  for (int i = chunk.begin; i < chunk.end; i++) {
     const int place = places[i];
     if (place < 0) continue;
-    int columns = place & MANY, rows = place >> MORE_BITS & MANY;
-    const int first = place >> 2 * MORE_BITS;
     const entry_t entry = {AS_KEY(z[i]), i};
-    if (!(columns | rows)) { entries[mine[first]++] = entry; continue; }
-    if (columns == MANY || rows == MANY) {
-      const box_t box = footprint(points_uv[2 * (size_t)i], points_uv[2 * (size_t)i + 1], radii[i], height, width);
-      columns = (box.x1 - 1) / TILE - box.x0 / TILE;
-      rows = (box.y1 - 1) / TILE - box.y0 / TILE;
-    }
-    for (int y = 0; y <= rows; y++)
-      for (int x = 0; x <= columns; x++) entries[mine[first + y * tiles_x + x]++] = entry;
+    const int2 more = more_tiles(place, i, height, width, points_uv, radii);
+    for (int y = 0; y <= more.y; y++)
+      for (int x = 0; x <= more.x; x++) entries[next[first_tile(place) + y * tiles_x + x]++] = entry;
   }
-}
-
-#define DIGIT_BITS 8
-#define DIGITS (1 << DIGIT_BITS)
-#define DIGIT(key, low) ((int)((key) >> (low)) & (DIGITS - 1))
-
-// Stable counting sort of n entries by two digits, from bit `low` on: a to b to a.
-inline void sort_two_digits(global entry_t* a, global entry_t* b, int n, int low) {
-  int cursor0[DIGITS], cursor1[DIGITS];
-  for (int d = 0; d < DIGITS; d++) cursor0[d] = cursor1[d] = 0;
-  for (int i = 0; i < n; i++) {
-    const key_bits key = a[i].key;
-    cursor0[DIGIT(key, low)]++;
-    cursor1[DIGIT(key, low + DIGIT_BITS)]++;
-  }
-  int sum0 = 0, sum1 = 0;
-  for (int d = 0; d < DIGITS; d++) {
-    const int count0 = cursor0[d], count1 = cursor1[d];
-    cursor0[d] = sum0;
-    cursor1[d] = sum1;
-    sum0 += count0;
-    sum1 += count1;
-  }
-  for (int i = 0; i < n; i++) { const entry_t e = a[i]; b[cursor0[DIGIT(e.key, low)]++] = e; }
-  for (int i = 0; i < n; i++) { const entry_t e = b[i]; a[cursor1[DIGIT(e.key, low + DIGIT_BITS)]++] = e; }
 }
 
 // What compositing needs of point id in the tile at (top, left).
@@ -149,51 +133,79 @@ inline record_t record_of(
   return record;
 }
 
+#ifndef TOGETHER
+#define DIGIT_BITS 8
+#define DIGITS (1 << DIGIT_BITS)
+#define DIGIT(key, low) ((int)((key) >> (low)) & (DIGITS - 1))
+// Shorter lists are sorted by insertion alone.
+#define FEW 24
+
+// Stable counting sort of a[0, n) by the two digits from bit `low` on, by way of room.
+inline void sort_by_two_digits(global entry_t* a, global entry_t* room, int n, int low) {
+  int first[DIGITS], second[DIGITS];
+  for (int d = 0; d < DIGITS; d++) first[d] = second[d] = 0;
+  for (int i = 0; i < n; i++) {
+    first[DIGIT(a[i].key, low)]++;
+    second[DIGIT(a[i].key, low + DIGIT_BITS)]++;
+  }
+  int firsts = 0, seconds = 0;
+  for (int d = 0; d < DIGITS; d++) {
+    const int here = first[d], there = second[d];
+    first[d] = firsts;
+    second[d] = seconds;
+    firsts += here;
+    seconds += there;
+  }
+  for (int i = 0; i < n; i++) room[first[DIGIT(a[i].key, low)]++] = a[i];
+  for (int i = 0; i < n; i++) a[second[DIGIT(room[i].key, low + DIGIT_BITS)]++] = room[i];
+}
+
+// Stable sort of a[0, n) by key. The two highest digits that differ are sorted by counting, which leaves little for
+// the insertion sort after them. Where it is not little (many depths that differ in the last digits alone), counting
+// goes on from the lowest digit: both are stable, so equal keys still are in the order of the index.
+inline void sort_list(global entry_t* a, global entry_t* room, int n) {
+  key_bits differing = 0;
+  for (int i = 1; i < n; i++) differing |= a[i].key ^ a[0].key;
+  if (differing == 0) return;
+  const int high = REAL_BITS - (int)clz(differing);
+  if (n > FEW) sort_by_two_digits(a, room, n, max(high - 2 * DIGIT_BITS, 0));
+  long moves_left = 8 * (long)n + FEW * FEW;
+  for (int i = 1; i < n && moves_left > 0; i++) {
+    const entry_t entry = a[i];
+    int to = i;
+    for (; to > 0 && a[to - 1].key > entry.key; to--) a[to] = a[to - 1];
+    a[to] = entry;
+    moves_left -= i - to;
+  }
+  if (moves_left <= 0)
+    for (int low = 0; low < high; low += 2 * DIGIT_BITS) sort_by_two_digits(a, room, n, low);
+}
+
+// One work-item a tile.
 kernel void sort_tiles(
     const int height, const int width, const int tiles_y, const int tiles_x,
     global const int* restrict tile_starts,   // [B * tiles + 1]
     global const REAL* restrict points_uv,    // [P, 2]
     global const REAL* restrict radii,        // [P]
     global const REAL* restrict opacities,    // [P]
-    global entry_t* restrict entries, global entry_t* restrict room,
+    global entry_t* restrict entries,         // [E] in, overwritten
+    global entry_t* restrict room,            // [E] room for the sort
     global record_t* restrict records,        // [E] out
-    global long* restrict tile_slots)         // [B * tiles] out
+    global long* restrict tile_slots)         // [B * tiles] out: pixels of the quads of all footprints
 {
   const int t = get_global_id(0);
   const int begin = tile_starts[t], n = tile_starts[t + 1] - begin;
-  tile_slots[t] = 0;
-  if (n == 0) return;
-  global entry_t* a = entries + begin;
-  key_bits differ = 0;
-  const key_bits first = a[0].key;
-  for (int i = 1; i < n; i++) differ |= a[i].key ^ first;
-  if (differ) {
-    const int high = REAL_BITS - (int)clz(differ);
-    bool done = false;
-    if (n > 24) sort_two_digits(a, room + begin, n, max(high - 2 * DIGIT_BITS, 0));
-    long budget = 8 * (long)n + 600;
-    for (int i = 1; i < n && budget > 0; i++) {
-      const entry_t e = a[i];
-      int j = i;
-      for (; j > 0 && a[j - 1].key > e.key; j--) a[j] = a[j - 1];
-      a[j] = e;
-      budget -= i - j;
-    }
-    if (budget <= 0)
-      for (int low = 0; low < high; low += 2 * DIGIT_BITS) sort_two_digits(a, room + begin, n, low);
-  }
-  const int tiles = tiles_x * tiles_y;
-  const int top = t % tiles / tiles_x * TILE, left = t % tiles_x * TILE;
+  const int tiles = tiles_x * tiles_y, top = t % tiles / tiles_x * TILE, left = t % tiles_x * TILE;
+  sort_list(entries + begin, room + begin, n);
   long slots = 0;
-  for (int i = 0; i < n; i++) {
-    const record_t record = record_of(a[i].id, top, left, height, width, points_uv, radii, opacities);
-    records[begin + i] = record;
+  for (int i = begin; i < begin + n; i++) {
+    const record_t record = record_of(entries[i].id, top, left, height, width, points_uv, radii, opacities);
+    records[i] = record;
     slots += 4 * quads_in(unpack_box(record.box));
   }
   tile_slots[t] = slots;
 }
-
-#ifdef TOGETHER
+#else
 #define GROUP (TILE * TILE)
 
 // Entries of a[0, n), sorted by key, that come before an entry of this key: smaller ones, and equal ones if asked for.

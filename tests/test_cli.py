@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vestcl import cli, doctor, runtime
+from vestcl import __version__, cli, doctor, runtime
 
 
 @pytest.fixture(autouse=True)
@@ -53,7 +53,7 @@ def test_an_unknown_device_is_one_red_line(capsys: pytest.CaptureFixture[str], m
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--version"]) == 0
-    assert capsys.readouterr().out == "vestcl 0.1.0\n"
+    assert capsys.readouterr().out == f"vestcl {__version__}\n"
 
 
 @pytest.mark.parametrize(("arguments", "code"), [("--help", 0), ("", 2), ("dance", 2), ("demo --seed x", 2)])

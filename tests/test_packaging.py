@@ -11,11 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from vestcl import __version__
+
 ROOT = Path(__file__).resolve().parents[1]
 BUILD_A_KERNEL = """
 import numpy as np
 from vestcl import runtime
-runtime.current().kernel("splat_bin.cl", "count_tiles", runtime.defines_for(np.dtype(np.float32)))
+runtime.current().kernel("unproject.cl", "unproject", runtime.defines_for(np.dtype(np.float32)))
 print(runtime.kernel_folder())
 """
 
@@ -25,8 +27,11 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `setup.py` needs of this repository, copied, so that pip's build folders don't litter it."""
     folder = tmp_path_factory.mktemp("a clone") / "vestcl checkout"
     no_caches = shutil.ignore_patterns("__pycache__")
-    for name in ("vestcl", "kernels", "tests", "train"):
+    for name in ("vestcl", "kernels"):
         shutil.copytree(ROOT / name, folder / name, ignore=no_caches)
+    for name in ("tests", "train"):  # must stay out of the wheel
+        (folder / name).mkdir()
+        (folder / name / "__init__.py").touch()
     for name in ("setup.py", "pyproject.toml", "LICENSE"):
         shutil.copy(ROOT / name, folder)
     return folder
@@ -66,6 +71,10 @@ def test_the_wheel_holds_every_kernel_and_module_and_nothing_else(wheel: Path, c
     modules = {f"vestcl/{name}" for name in files(checkout / "vestcl", "*.py")}
     assert kernels
     assert shipped == kernels | modules
+
+
+def test_both_versions_are_one(wheel: Path) -> None:
+    assert wheel.name == f"vestcl-{__version__}-py3-none-any.whl"
 
 
 def test_kernels_build_from_a_wheel(wheel: Path, tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """The command line: `vestcl devices`, `doctor`, `demo` and `bench`. Whatever imports torch is imported late."""
 
-import importlib.metadata
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vestcl import doctor, runtime
+from vestcl import __version__, doctor, runtime
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Devices:
             )
         console = Console()
         console.print(table)
-        console.print("* is what vestcl uses; VESTCL_DEVICE (an index or part of a name) chooses another")
+        console.print("* is in use; VESTCL_DEVICE (an index or a part of a name) chooses another")
         return 0
 
 
@@ -110,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         if arguments == ["--version"]:
-            print(f"vestcl {importlib.metadata.version('vestcl')}")
+            print(f"vestcl {__version__}")
             return 0
         if arguments[:1] == ["bench"]:
             return _bench(arguments[1:])

@@ -274,6 +274,7 @@ class Session:
         self._kernels: dict[tuple[str, tuple[tuple[str, str | int], ...]], dict[str, cl.Kernel]] = {}
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self._queue))
         self._lock = threading.RLock()
+        self._job: Job | None = None
         self._profile: list[tuple[str, cl.Event]] | None = None
 
     def __repr__(self) -> str:
@@ -282,6 +283,15 @@ class Session:
     def job(self) -> "Job":
         """A `Job` on this device; ``with session.job() as job`` holds the device until it is done."""
         return Job(self)
+
+    @property
+    def scratch_bytes(self) -> int:
+        """Device memory that the session's scratch pool holds now, in use or not: it never shrinks by itself."""
+        return int(self._pool.managed_bytes)
+
+    def free_scratch(self) -> None:
+        """Give scratch memory that nothing uses back to the system."""
+        self._pool.free_held()
 
     def kernel(self, file: str, name: str, defines: Defines) -> cl.Kernel:
         """Kernel ``name`` of ``file`` built with ``defines``; each program is built once and kept."""
@@ -320,22 +330,29 @@ class Session:
 
 
 class Job:
-    """Arrays and launches of one operator call. See the module's example."""
+    """Arrays and launches of one operator call. See the module's example. Inside another job, only that one waits."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
+        self._outer: Job | None = None
+        self._bound: list[cl.Buffer] = []
         self._outputs: list[tuple[cl.Buffer, np.ndarray]] = []
 
     def __enter__(self) -> "Job":
         self.session._lock.acquire()
+        self._outer, self.session._job = self.session._job, self
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.session._job = self._outer
         try:
-            if kind is None:
-                self.sync()
-            else:
+            if kind is not None:
                 self.session._queue.finish()
+            elif self._outer is None:
+                self.sync()
+            else:  # the outer job waits for all
+                self._outer._bound += self._bound
+                self._outer._outputs += self._outputs
         finally:
             self.session._lock.release()
 
@@ -343,7 +360,9 @@ class Job:
         """``array`` as kernel input; on a CPU device the kernel reads the array itself."""
         assert array.flags.forc and array.size > 0
         where = cl.mem_flags.USE_HOST_PTR if self.session.shares_host_memory else cl.mem_flags.COPY_HOST_PTR
-        return cl.Buffer(self.session._context, cl.mem_flags.READ_ONLY | where, hostbuf=array)
+        buffer = cl.Buffer(self.session._context, cl.mem_flags.READ_ONLY | where, hostbuf=array)
+        self._bound.append(buffer)  # it owns the array, which has to outlive the kernels that read it
+        return buffer
 
     def write(self, array: np.ndarray) -> cl.Buffer:
         """``array`` as kernel output, complete after `sync`; on a CPU device the kernel writes into it."""
@@ -390,6 +409,7 @@ class Job:
                 cl.enqueue_copy(queue, array, buffer, is_blocking=False)
         queue.finish()
         self._outputs.clear()
+        self._bound.clear()
 
 
 def defines_for(dtype: np.dtype, **more: str | int) -> dict[str, str | int]:

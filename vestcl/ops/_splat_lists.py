@@ -153,5 +153,4 @@ def _sort(
             )  # fmt: skip
         else:
             job.launch("splat_bin.cl", "sort_tiles", defines, (tiles,), arguments)
-        job.sync()
     return TileLists(job.session, tile_starts, tile_slots, span, records, places, slot_starts)

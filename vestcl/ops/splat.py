@@ -87,8 +87,9 @@ def splat(
 
     Source: SPEC section 2; the footprint is 3D Moments' (CVPR 2022), without its limit on fragments per pixel.
     """
-    raster = rasterize(points_uv, z, radii, opacities, height, width, cloud_starts=cloud_starts)
-    return composite(raster, features, backgrounds, min_transmittance)
+    with runtime.current().job():
+        raster = rasterize(points_uv, z, radii, opacities, height, width, cloud_starts=cloud_starts)
+        return composite(raster, features, backgrounds, min_transmittance)
 
 
 def rasterize(
@@ -146,7 +147,7 @@ def composite(
         **{
             "raster.points_uv": (raster.points_uv, letters.replace("C", "2")),
             "features": (features, letters),
-            "backgrounds": (backgrounds, f"{raster.geometry.batch} {features.shape[-1]}"),
+            "backgrounds": (backgrounds, f"{raster.geometry.batch} {features.shape[-1]} | None"),
         }
     )
     if not 1 <= features.shape[-1] <= constants.MAX_CHANNELS:
