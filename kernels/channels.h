@@ -2,12 +2,16 @@
 // vector overlaps the one before by OVERLAP lanes, so that every access stays inside the row and is a whole vector.
 //   CHANNELS   numbers a row
 //   VECTOR     1, 4, 8 or 16 lanes, at most CHANNELS
+//   BUILTINS   1: the compiler has clang's builtins for prefetching and streaming
 //   STREAM     1: rows are whole, aligned cache lines and VECTOR divides them; write them past the cache
 #ifndef CHANNELS
 #error "define CHANNELS, the number of features of a point"
 #endif
 #ifndef VECTOR
 #error "define VECTOR, the lanes of a vector of channels"
+#endif
+#ifndef BUILTINS
+#error "define BUILTINS as 0 or 1"
 #endif
 #ifndef STREAM
 #error "define STREAM as 0 or 1"
@@ -97,12 +101,9 @@ inline void add_row(const vector_t* blocks, global REAL* row) {
   store_row(sums, row);
 }
 
-#if defined(__has_builtin)
-#if __has_builtin(__builtin_prefetch)
+#if BUILTINS
 #define PREFETCH(pointer) __builtin_prefetch((const void*)(uintptr_t)(pointer), 0, 3)
-#endif
-#endif
-#ifndef PREFETCH
+#else
 #define PREFETCH(pointer)
 #endif
 #define CACHE_LINE 64

@@ -20,12 +20,14 @@ typedef struct { key_bits key, id; } entry_t;
 typedef struct { REAL u, v, r, r2, slope, o; int box, id; } record_t;
 
 // A footprint inside one tile, and whether it is the point's whole footprint.
-inline int pack_box(box_t box, bool whole) { return box.x0 | box.x1 << 5 | box.y0 << 10 | box.y1 << 15 | (int)whole << 20; }
+inline int pack_box(box_t box, bool whole) {
+  return box.x0 | box.x1 << 5 | box.y0 << 10 | box.y1 << 15 | (int)whole << 20;
+}
 inline box_t unpack_box(int packed) {
   const box_t box = {packed & 31, packed >> 10 & 31, packed >> 5 & 31, packed >> 15 & 31};
   return box;
 }
-inline bool is_whole(int packed) { return packed >> 20; }
+inline bool is_whole(int packed) { return packed >> 20 & 1; }
 
 // Pixels of an image whose centres (x + 0.5, y + 0.5) lie in the square of half side r about (u, v).
 inline box_t footprint(REAL u, REAL v, REAL r, int height, int width) {

@@ -97,7 +97,7 @@ kernel void fill_tiles(
     global const REAL* restrict radii,        // [P]
     global const int* restrict places,        // [P]
     global const int* restrict tile_starts,   // [B * tiles + 1]
-    global int* restrict counts,              // [B, chunks, tiles] in, used up: from where in the list each chunk writes
+    global int* restrict counts,              // [B, chunks, tiles] in, used up: where in the list a chunk writes next
     global entry_t* restrict entries)         // [E] out
 {
   const int c = get_global_id(0), chunks = get_global_size(0), b = get_global_id(1);

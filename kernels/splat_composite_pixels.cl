@@ -179,8 +179,10 @@ kernel void sum_slots(
     for (int c = 0; c < CHANNELS; c++) {
       REAL sum = 0;
       for (int y = box.y0; y < box.y1; y++)
-        for (int x = box.x0; x < box.x1; x++)
-          sum += slot_weights[slots + slot_in(box, x, y)] * g[((long)y * width + x) * pixel_stride + c * channel_stride];
+        for (int x = box.x0; x < box.x1; x++) {
+          const long pixel = ((long)y * width + x) * pixel_stride;
+          sum += slot_weights[slots + slot_in(box, x, y)] * g[pixel + c * channel_stride];
+        }
       const size_t at = (size_t)point.id * CHANNELS + c;
       grad_features[at] = (whole ? (REAL)0 : grad_features[at]) + sum;
     }

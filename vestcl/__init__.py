@@ -1,10 +1,15 @@
 """vestcl: differentiable point splatting in OpenCL, for forecasting driving video from novel views."""
 
-from vestcl.ops.displace import displace
-from vestcl.ops.rigid_flow import rigid_flow
-from vestcl.ops.splat import Raster, composite, rasterize, splat
-from vestcl.ops.unproject import unproject
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from vestcl.runtime import DeviceError, DeviceInfo, devices, use
+
+if TYPE_CHECKING:  # the others load on first use, for importing torch takes seconds
+    from vestcl.ops.displace import displace
+    from vestcl.ops.rigid_flow import rigid_flow
+    from vestcl.ops.splat import Raster, composite, rasterize, splat
+    from vestcl.ops.unproject import unproject
 
 __version__ = "0.1.0"
 __all__ = [
@@ -20,3 +25,11 @@ __all__ = [
     "unproject",
     "use",
 ]
+
+_FILES = {"Raster": "splat", "composite": "splat", "rasterize": "splat"}  # others are in the file of their own name
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'vestcl' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"vestcl.ops.{_FILES.get(name, name)}"), name)

@@ -114,7 +114,7 @@ def select(selector: str | None = None) -> DeviceInfo:
     Args:
         selector: ``"0:1"`` (platform:device), or a part of the platform's, device's or driver's name in any case, such as
             ``"pocl"``, ``"intel"``, ``"nvidia"``. None: the environment variable VESTCL_DEVICE, and without
-            it the PoCL that pip installed, else any CPU, else any device.
+            it the first PoCL (pip installs one), else the first CPU, else the first device.
 
     Raises:
         DeviceError: no device fits; the message lists those that there are.
@@ -122,7 +122,7 @@ def select(selector: str | None = None) -> DeviceInfo:
     selector = selector or os.environ.get("VESTCL_DEVICE")
     infos = devices()
     if not infos:
-        raise DeviceError("no OpenCL device found; `pip install 'pyopencl[pocl]'` brings one for the CPU")
+        raise DeviceError("no OpenCL device found: `pip install 'pyopencl[pocl]'` brings one for the CPU")
     if selector is None:
         return min(infos, key=lambda info: (info.kind != "CPU", "PoCL" not in info.version))
     if re.fullmatch(r"\d+:\d+", selector):
@@ -187,7 +187,7 @@ def open_session(info: DeviceInfo, mapping: str) -> "Session":
 
 @functools.cache
 def kernel_folder() -> Path:
-    """Where the .cl files are: vestcl/kernels in a wheel, kernels/ beside the package in a checkout or editable install."""
+    """Where the .cl files are: vestcl/kernels in a wheel, kernels/ beside the package in a checkout (editable or not)."""
     package = Path(__file__).resolve().parent
     for folder in (package / "kernels", package.parent / "kernels"):
         if (folder / "common.h").is_file():
@@ -197,7 +197,7 @@ def kernel_folder() -> Path:
 
 @functools.cache
 def source(name: str) -> str:
-    """The text of kernel file ``name`` with its ``#include "..."`` lines inlined, and #line so that errors point home."""
+    """Kernel file ``name`` with its ``#include "..."`` lines inlined, and #line so that errors point home."""
     text = (kernel_folder() / name).read_text()
     parts = [f'#line 1 "{name}"']
     for number, line in enumerate(text.splitlines(), start=1):
@@ -267,7 +267,10 @@ class Session:
     def __init__(self, info: DeviceInfo, mapping: str, device: cl.Device) -> None:
         self.info = info
         self.mapping = mapping
-        self.shares_host_memory = info.kind == "CPU"
+        # Oclgrind calls itself a CPU, but takes memory that it did not copy for uninitialised.
+        self.shares_host_memory = info.kind == "CPU" and info.platform != "Oclgrind"
+        # Compilers that turn clang's builtins for prefetching and streaming into the instructions.
+        self.compiles_builtins = info.platform.startswith(("Portable Computing Language", "Intel"))
         self._context = cl.Context([device])
         self._device = device
         self._queue = cl.CommandQueue(self._context)
@@ -303,7 +306,7 @@ class Session:
 
     def _build(self, file: str, defines: Defines) -> cl.Program:
         if defines.get("REAL") == "double" and not self.info.float64:
-            raise DeviceError(f"{self.info.name} has no float64; pass float32 or choose another device (`vestcl devices`)")
+            raise DeviceError(f"{self.info.name} has no float64: pass float32, or choose another of `vestcl devices`")
         options = ["-cl-std=CL1.2", *(f"-D{key}={value}" for key, value in defines.items())]
         # The CPU that name_cpu() gave is not in the key of PoCL's own disk cache: a comment puts it there.
         text = f"// {pocl_cpu.host_key()}\n{source(file)}"
@@ -317,10 +320,10 @@ class Session:
         """Collect every kernel's start and end inside the ``with`` block; the list is filled when it ends."""
         times: list[KernelTime] = []
         with self._lock:
-            plain, self._queue = self._queue, cl.CommandQueue(
-                self._context, properties=cl.command_queue_properties.PROFILING_ENABLE
-            )
-            self._profile = events = []
+            plain = self._queue
+            self._queue = cl.CommandQueue(self._context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+            events: list[tuple[str, cl.Event]] = []
+            self._profile = events
             try:
                 yield times
             finally:
@@ -356,7 +359,7 @@ class Job:
         finally:
             self.session._lock.release()
 
-    def read(self, array: np.ndarray) -> cl.Buffer:
+    def read(self, array: np.ndarray) -> Buffer:
         """``array`` as kernel input; on a CPU device the kernel reads the array itself."""
         assert array.flags.forc and array.size > 0
         where = cl.mem_flags.USE_HOST_PTR if self.session.shares_host_memory else cl.mem_flags.COPY_HOST_PTR
@@ -364,7 +367,7 @@ class Job:
         self._bound.append(buffer)  # it owns the array, which has to outlive the kernels that read it
         return buffer
 
-    def write(self, array: np.ndarray) -> cl.Buffer:
+    def write(self, array: np.ndarray) -> Buffer:
         """``array`` as kernel output, complete after `sync`; on a CPU device the kernel writes into it."""
         assert array.flags.c_contiguous and array.size > 0
         flags = cl.mem_flags.READ_WRITE
@@ -375,7 +378,7 @@ class Job:
         self._outputs.append((buffer, array))
         return buffer
 
-    def scratch(self, count: int, dtype: Any) -> cl.Buffer:
+    def scratch(self, count: int, dtype: Any) -> Buffer:
         """Uninitialised device memory from the session's pool; it goes back when the last reference does."""
         return self.session._pool.allocate(max(1, count) * np.dtype(dtype).itemsize)
 
@@ -390,7 +393,8 @@ class Job:
     ) -> None:
         """Enqueue kernel ``name``; scalars come as NumPy scalars of the exact C type."""
         kernel = self.session.kernel(file, name, defines)
-        kernel.set_args(*arguments)
+        values: Sequence[Any] = arguments  # pyopencl's type for them leaves out its own pooled buffers
+        kernel.set_args(*values)
         local = tuple(local_size) if local_size else (1,) * len(global_size)
         event = cl.enqueue_nd_range_kernel(self.session._queue, kernel, tuple(global_size), local)
         if self.session._profile is not None:
@@ -399,15 +403,16 @@ class Job:
     def sync(self) -> None:
         """Wait for everything enqueued; afterwards the arrays given to `write` hold their results."""
         queue = self.session._queue
+        maps = []
         for buffer, array in self._outputs:
             if self.session.shares_host_memory:
-                mapped, _ = cl.enqueue_map_buffer(
-                    queue, buffer, cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=False
-                )
-                mapped.base.release(queue)
+                place = (cl.map_flags.READ, 0, array.shape, array.dtype)
+                maps.append(cl.enqueue_map_buffer(queue, buffer, *place, is_blocking=False)[0])
             else:
                 cl.enqueue_copy(queue, array, buffer, is_blocking=False)
         queue.finish()
+        for mapped in maps:  # not before: rusticl aborts where a map has not come about yet
+            mapped.base.release(queue)
         self._outputs.clear()
         self._bound.clear()
 

@@ -65,8 +65,10 @@ class Layer:
         else:
             itemsize, line = self.dtype.itemsize, constants.CACHE_LINE
             widths = (n for n in (16, 8, 4, 1) if n <= self.channels and n * itemsize <= line)
-            stream = self.lists.session.info.kind == "CPU" and self.channels * itemsize % line == 0
-            own |= {"VECTOR": next(widths), "STREAM": int(stream), "SEGMENT": constants.SEGMENT}
+            builtins = self.lists.session.compiles_builtins
+            stream = builtins and self.channels * itemsize % line == 0
+            own |= {"VECTOR": next(widths), "SEGMENT": constants.SEGMENT}
+            own |= {"BUILTINS": int(builtins), "STREAM": int(stream)}
         return runtime.defines_for(self.dtype, **own)
 
     def scalars(self) -> list[np.generic]:

@@ -70,8 +70,8 @@ class TileLists:
     """[E] record_t of kernels/splat.h."""
     places: runtime.Buffer
     """[P] int32: the tiles of each point, see pack_place in kernels/splat.h."""
-    slot_starts: runtime.Buffer | None
-    """[E] int64: an entry's first slot in its tile; for the mapping "pixel"."""
+    slot_starts: runtime.Buffer
+    """[E] int64: an entry's first slot in its tile; only the mapping "pixel" has it."""
 
 
 def chunks_of(session: runtime.Session, points: int, counters: int) -> int:
@@ -138,12 +138,13 @@ def _sort(
     count, tiles = int(tile_starts[-1]), len(tile_starts) - 1
     together = job.session.mapping == "pixel"
     records = job.scratch(count, np.dtype(f"V{6 * geometry.z.dtype.itemsize + 8}"))
-    slot_starts = job.scratch(count, np.int64) if together else None
+    slot_starts = job.scratch(count if together else 0, np.int64)
     tile_slots = np.zeros(tiles, np.int64)
     if entries is not None and count:
         arrays = (tile_starts, geometry.points_uv, geometry.radii, geometry.opacities)
-        arguments = [*geometry.sizes, *map(job.read, arrays), entries, job.scratch(count, _entry_type(geometry)),
-                     records, job.write(tile_slots)]  # fmt: skip
+        room = job.scratch(count, _entry_type(geometry))
+        arguments: list[runtime.Argument] = [*geometry.sizes, *map(job.read, arrays)]
+        arguments += [entries, room, records, job.write(tile_slots)]
         defines = runtime.defines_for(geometry.z.dtype)
         if together:
             group = constants.TILE**2

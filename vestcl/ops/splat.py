@@ -125,11 +125,13 @@ def rasterize(
     if starts[-1] >= 2**31:
         raise ValueError(f"`points_uv` must hold fewer than 2**31 points, got {starts[-1]}")
     geometry = Geometry(
-        as_array(points_uv).reshape(-1, 2),
-        *(as_array(array).reshape(-1) for array in (z, radii, opacities)),
-        starts.astype(np.int32),
-        _size("height", height),
-        _size("width", width),
+        points_uv=as_array(points_uv).reshape(-1, 2),
+        z=as_array(z).reshape(-1),
+        radii=as_array(radii).reshape(-1),
+        opacities=as_array(opacities).reshape(-1),
+        cloud_starts=starts.astype(np.int32),
+        height=_size("height", height),
+        width=_size("width", width),
     )
     lists = list_tiles(runtime.current(), geometry)
     return Raster(points_uv, radii, opacities, cloud_starts is not None, geometry, lists)
@@ -202,9 +204,7 @@ class _Composite(torch.autograd.Function):
         return None, None, *shaped
 
 
-def _layer(
-    raster: Raster[Any], features: Array, backgrounds: Array | None, min_transmittance: float
-) -> Layer:
+def _layer(raster: Raster[Any], features: Array, backgrounds: Array | None, min_transmittance: float) -> Layer:
     rows = as_array(features).reshape(-1, features.shape[-1])
     if backgrounds is None:
         behind = np.zeros((raster.geometry.batch, rows.shape[1]), rows.dtype)

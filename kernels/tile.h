@@ -1,0 +1,95 @@
+// How a work-item walks one tile: in quads of 2 x 2 pixels, the lanes of a vector of four. After splat.h, channels.h.
+//   TRUNCATE   1: a pixel takes no more fragments once T < min_transmittance; 0: it takes all
+#ifndef TRUNCATE
+#error "define TRUNCATE as 0 or 1"
+#endif
+#if TRUNCATE
+#define EXISTS(d2, r2, t) (((d2) < (r2)) & ((t) >= min_transmittance))
+#else
+#define EXISTS(d2, r2, t) ((d2) < (r2))
+#endif
+
+// A footprint is walked in quads: pixels p, p + 1, p + STRIDE, p + STRIDE + 1. A quad may reach one pixel beyond its
+// footprint (where alpha is 0) and beyond the tile, into an apron that is never shown and has no gradient.
+#define STRIDE (TILE + 1)
+#define ROOM (STRIDE * STRIDE)
+
+typedef struct { int b, left, top, width, height; } tile_t;
+
+inline tile_t tile_at(int t, int height, int width, int tiles_y, int tiles_x) {
+  tile_t tile;
+  tile.b = t / (tiles_y * tiles_x);
+  tile.left = t % tiles_x * TILE;
+  tile.top = t / tiles_x % tiles_y * TILE;
+  tile.width = min(TILE, width - tile.left);
+  tile.height = min(TILE, height - tile.top);
+  return tile;
+}
+
+// Whether no pixel of the tile can change any more.
+inline bool is_opaque(const REAL* transmittance, tile_t tile, REAL min_transmittance) {
+  int open = 0;
+  for (int y = 0; y < tile.height; y++)
+    for (int x = 0; x < tile.width; x++) {
+      const REAL t = transmittance[y * STRIDE + x];
+      open += EXISTS(0, 1, t) & (t != 0);
+    }
+  return open == 0;
+}
+
+// What a quad's alphas need of a point, relative to the tile.
+typedef struct { REAL4 u, v; REAL r2, slope, o; } disc_t;
+
+inline disc_t disc_of(global const record_t* point, tile_t tile) {
+  const disc_t disc = {
+      point->u - tile.left - (REAL)0.5 - (REAL4)(0, 1, 0, 1), point->v - tile.top - (REAL)0.5 - (REAL4)(0, 0, 1, 1),
+      point->r2, point->slope, point->o};
+  return disc;
+}
+
+inline REAL4 load_quad(const REAL* pixels, int p) {
+  return (REAL4)(vload2(0, pixels + p), vload2(0, pixels + p + STRIDE));
+}
+
+inline void store_quad(REAL4 quad, REAL* pixels, int p) {
+  vstore2(quad.lo, 0, pixels + p);
+  vstore2(quad.hi, 0, pixels + p + STRIDE);
+}
+
+// Alphas of the quad at (x, y), and in *before the transmittances t: both 0 where there is no fragment.
+inline REAL4 quad_alphas(disc_t disc, int x, int y, REAL4 t, REAL min_transmittance, REAL4* before) {
+  const REAL4 dx = x - disc.u, dy = y - disc.v, d2 = dx * dx + dy * dy;
+  *before = EXISTS(d2, disc.r2, t) ? t : (REAL4)0;
+  return EXISTS(d2, disc.r2, t) ? disc.o - disc.slope * d2 : (REAL4)0;
+}
+
+#ifdef GRAD_FEATURES
+// The gradients at the tile's pixels, 0 outside the image and in the apron. Lanes that overlap are 0, to count once
+// in a dot product.
+inline void load_grad_image(
+    vector_t grads[ROOM][BLOCKS], tile_t tile, int height, int width, long pixel_stride, long channel_stride,
+    global const REAL* grad_image) {
+  for (int y = 0; y < STRIDE; y++)
+    for (int x = y < tile.height ? tile.width : 0; x < STRIDE; x++)
+#pragma unroll
+      for (int k = 0; k < BLOCKS; k++) grads[y * STRIDE + x][k] = 0;
+  for (int y = 0; y < tile.height; y++) {
+    global const REAL* row = grad_image + ((long)tile.b * height * width * CHANNELS) +
+                             ((long)(tile.top + y) * width + tile.left) * pixel_stride;
+    REAL* to = (REAL*)grads[y * STRIDE];
+    if (channel_stride == 1)
+      for (int x = 0; x < tile.width; x++) {
+        load_row(row + x * pixel_stride, grads[y * STRIDE + x]);
+        for (int lane = 0; lane < OVERLAP; lane++) to[(x * BLOCKS + BLOCKS - 1) * VECTOR + lane] = 0;
+      }
+    else
+      for (int k = 0; k < BLOCKS; k++)
+        for (int lane = 0; lane < VECTOR; lane++) {
+          const bool again = k == BLOCKS - 1 && lane < OVERLAP;
+          global const REAL* from = row + (BLOCK_START(k) + lane) * channel_stride;
+          for (int x = 0; x < tile.width; x++)
+            to[(x * BLOCKS + k) * VECTOR + lane] = again ? (REAL)0 : from[x * pixel_stride];
+        }
+  }
+}
+#endif
