@@ -68,14 +68,17 @@ inline REAL4 sum_lanes_of_four(const vector_t* v) {
 }
 #endif
 
+inline void copy_row(global const REAL* row, vector_t* blocks) {
+#pragma unroll
+  for (int k = 0; k < BLOCKS; k++) blocks[k] = *(global const loose_vector_t*)(row + BLOCK_START(k));
+}
+
 // Read a row; false where one of its numbers is NaN or infinite (x * 0 is 0 only for finite x).
 inline bool load_row(global const REAL* row, vector_t* blocks) {
+  copy_row(row, blocks);
   vector_t zero = 0;
 #pragma unroll
-  for (int k = 0; k < BLOCKS; k++) {
-    blocks[k] = *(global const loose_vector_t*)(row + BLOCK_START(k));
-    zero += blocks[k] * 0;
-  }
+  for (int k = 0; k < BLOCKS; k++) zero += blocks[k] * 0;
   return sum_lanes(zero) == 0;
 }
 

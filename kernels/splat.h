@@ -29,15 +29,25 @@ inline box_t unpack_box(int packed) {
 }
 inline bool is_whole(int packed) { return packed >> 20 & 1; }
 
-// Pixels of an image whose centres (x + 0.5, y + 0.5) lie in the square of half side r about (u, v).
+// The indices of the pixels in [0, size) whose centres lie in (low, high) are [first_pixel(low), end_pixel(high)).
+inline int first_pixel(REAL low, int size) {
+  low -= (REAL)0.5 + SLACK;
+  low = low > 0 ? low : 0;
+  low = low < size ? low : size;
+  const int whole = (int)low;
+  return whole + (low > whole);
+}
+
+inline int end_pixel(REAL high, int size) {
+  high += (REAL)0.5 + SLACK;
+  high = high > 0 ? high : 0;
+  high = high < size ? high : size;
+  return (int)high;
+}
+
 inline box_t footprint(REAL u, REAL v, REAL r, int height, int width) {
-  const REAL half_pixel = (REAL)0.5 + SLACK;
-  const REAL4 size = (REAL4)(width, height, width, height);
-  REAL4 edge = (REAL4)(u - r - half_pixel, v - r - half_pixel, u + r + half_pixel, v + r + half_pixel);
-  edge = edge > 0 ? edge : (REAL4)0;
-  edge = edge < size ? edge : size;
-  const int4 whole = convert_int4(edge);
-  const box_t box = {whole.x + (edge.x > whole.x), whole.y + (edge.y > whole.y), whole.z, whole.w};
+  const box_t box = {
+      first_pixel(u - r, width), first_pixel(v - r, height), end_pixel(u + r, width), end_pixel(v + r, height)};
   return box;
 }
 

@@ -20,9 +20,9 @@
 #include "tile.h"
 
 // Points read ahead of their turn.
-#define AHEAD 8
+#define AHEAD 24
 // Entries between two looks whether every pixel of the tile is opaque.
-#define LOOK_EVERY 64
+#define LOOK_EVERY 256
 
 inline void read_ahead(global const record_t* records, int e, global const REAL* features) {
   global const REAL* row = features + (size_t)records[e].id * CHANNELS;
@@ -82,7 +82,7 @@ kernel void composite_tiles(
   tile_finite[index] = finite;
 
   vector_t background[BLOCKS];
-  load_row(backgrounds + (size_t)tile.b * CHANNELS, background);
+  copy_row(backgrounds + (size_t)tile.b * CHANNELS, background);
   for (int y = 0; y < tile.height; y++)
     for (int x = 0; x < tile.width; x++) {
       const int p = y * STRIDE + x;
@@ -130,31 +130,42 @@ inline int walk_forward(
   return e;
 }
 
-// What lies behind the last fragment of every pixel: A_end, and the background's gradient of the tile.
+// What lies behind the last fragment of every pixel: A_end = b.g - h.
 inline void look_behind(
-    const vector_t g[ROOM][BLOCKS], const REAL* transmittance, tile_t tile, int height, int width,
-    global const REAL* background_row, global const REAL* grad_coverage, REAL* behind, vector_t* grad_background) {
-  vector_t background[BLOCKS];
-  load_row(background_row, background);
+    const vector_t g[ROOM][BLOCKS], tile_t tile, int height, int width, global const REAL* background_row,
+    global const REAL* grad_coverage, REAL* behind) {
   for (int p = 0; p < ROOM; p++) behind[p] = 0;
-  for (int k = 0; k < BLOCKS; k++) grad_background[k] = 0;
-  for (int y = 0; y < tile.height; y++) {
-    vector_t row_sum[BLOCKS];
+#if HAS_BACKGROUNDS
+  vector_t background[BLOCKS];
+  copy_row(background_row, background);
+  for (int p = 0; p < ROOM; p++) {
+    vector_t products = 0;
 #pragma unroll
-    for (int k = 0; k < BLOCKS; k++) row_sum[k] = 0;
-    for (int x = 0; x < tile.width; x++) {
-      const int p = y * STRIDE + x;
-      vector_t products = 0;
-#pragma unroll
-      for (int k = 0; k < BLOCKS; k++) {
-        products += background[k] * g[p][k];
-        row_sum[k] += transmittance[p] * g[p][k];
-      }
-      const size_t at = ((size_t)tile.b * height + tile.top + y) * width + tile.left + x;
-      behind[p] = sum_lanes(products) - grad_coverage[at];
-    }
-    for (int k = 0; k < BLOCKS; k++) grad_background[k] += row_sum[k];
+    for (int k = 0; k < BLOCKS; k++) products += background[k] * g[p][k];
+    behind[p] = sum_lanes(products);
   }
+#endif
+#if HAS_GRAD_COVERAGE
+  for (int y = 0; y < tile.height; y++) {
+    global const REAL* row = grad_coverage + ((size_t)tile.b * height + tile.top + y) * width + tile.left;
+    for (int x = 0; x < tile.width; x++) behind[y * STRIDE + x] -= row[x];
+  }
+#endif
+}
+
+// The tile's share of the background's gradient: T_end g summed over each row of pixels, then over the rows.
+inline void sum_background(
+    const vector_t g[ROOM][BLOCKS], const REAL* transmittance, tile_t tile, global REAL* grad_row) {
+  vector_t total[BLOCKS];
+  for (int k = 0; k < BLOCKS; k++) total[k] = 0;
+  for (int y = 0; y < tile.height; y++) {
+    vector_t sum[BLOCKS];
+    for (int k = 0; k < BLOCKS; k++) sum[k] = 0;
+    for (int x = 0; x < tile.width; x++)
+      for (int k = 0; k < BLOCKS; k++) sum[k] += transmittance[y * STRIDE + x] * g[y * STRIDE + x][k];
+    for (int k = 0; k < BLOCKS; k++) total[k] += sum[k];
+  }
+  store_row(total, grad_row);
 }
 
 // Walk a segment's entries back to front, writing or adding to their points' gradients.
@@ -269,16 +280,13 @@ kernel void composite_tiles_backward(
     stop = walk_forward(&walk, first, end, finite, tile, min_transmittance, records, features);
   }
 
-  REAL behind[ROOM];
-  vector_t grad_background[BLOCKS];
-  look_behind(
-      g, walk.transmittance, tile, height, width, backgrounds + (size_t)tile.b * CHANNELS, grad_coverage, behind,
-      grad_background);
 #if GRAD_BACKGROUNDS
-  store_row(grad_background, tile_grad_backgrounds + (size_t)index * CHANNELS);
+  sum_background(g, walk.transmittance, tile, tile_grad_backgrounds + (size_t)index * CHANNELS);
 #endif
 
   // Backward, segment by segment.
+  REAL behind[ROOM];
+  look_behind(g, tile, height, width, backgrounds + (size_t)tile.b * CHANNELS, grad_coverage, behind);
   for (;;) {
     walk_back(
         &walk, g, behind, first, stop, tile, records, features, grad_features, grad_points_uv, grad_radii,

@@ -131,8 +131,13 @@ kernel void composite_pixels_backward(
   const size_t at = ((size_t)b * height + y) * width + x;
   transmittance[at] = t;
   global const REAL* g = grad_image + (long)b * height * width * CHANNELS + ((long)y * width + x) * pixel_stride;
-  REAL behind = -grad_coverage[at];
+  REAL behind = 0;
+#if HAS_GRAD_COVERAGE
+  behind -= grad_coverage[at];
+#endif
+#if HAS_BACKGROUNDS
   for (int c = 0; c < CHANNELS; c++) behind += backgrounds[b * CHANNELS + c] * g[c * channel_stride];
+#endif
   for (int e = end - 1; e >= begin; e--) {
     const box_t box = unpack_box(records[e].box);
     if (column < box.x0 || column >= box.x1 || line < box.y0 || line >= box.y1) continue;

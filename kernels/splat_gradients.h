@@ -1,4 +1,5 @@
 // What both mappings of the backward share: which gradients are computed, and those no tile computes alone.
+//   HAS_BACKGROUNDS, HAS_GRAD_COVERAGE   0 or 1: whether these are given, or all 0
 //   GRAD_FEATURES, GRAD_POINTS_UV, GRAD_RADII, GRAD_OPACITIES, GRAD_BACKGROUNDS   0 or 1
 #ifdef GRAD_FEATURES
 #define GRAD_GEOMETRY (GRAD_POINTS_UV || GRAD_RADII || GRAD_OPACITIES)

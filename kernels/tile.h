@@ -79,7 +79,7 @@ inline void load_grad_image(
     REAL* to = (REAL*)grads[y * STRIDE];
     if (channel_stride == 1)
       for (int x = 0; x < tile.width; x++) {
-        load_row(row + x * pixel_stride, grads[y * STRIDE + x]);
+        copy_row(row + x * pixel_stride, grads[y * STRIDE + x]);
         for (int lane = 0; lane < OVERLAP; lane++) to[(x * BLOCKS + BLOCKS - 1) * VECTOR + lane] = 0;
       }
     else

@@ -38,8 +38,8 @@ class Layer:
     lists: TileLists
     features: Array
     """[P, C]"""
-    backgrounds: Array
-    """[B, C]"""
+    backgrounds: Array | None
+    """[B, C]; None is zero."""
     min_transmittance: float
 
     @property
@@ -71,6 +71,10 @@ class Layer:
             own |= {"BUILTINS": int(builtins), "STREAM": int(stream)}
         return runtime.defines_for(self.dtype, **own)
 
+    def backgrounds_or_zero(self) -> Array:
+        zero = (self.geometry.batch, self.channels)
+        return np.zeros(zero, self.dtype) if self.backgrounds is None else self.backgrounds
+
     def scalars(self) -> list[np.generic]:
         return [*self.geometry.sizes, self.dtype.type(self.min_transmittance)]
 
@@ -84,12 +88,13 @@ def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
     finite = np.ones(geometry.points if layer.pixels else tiles, np.int32)
     with lists.session.job() as job:
         features = _read(job, layer.features)
+        backgrounds = job.read(layer.backgrounds_or_zero())
         lists_read = [job.read(lists.tile_starts), lists.records]
         shown = [job.write(image), job.write(coverage)]
         if not layer.pixels:
             job.launch(
                 _TILES, "composite_tiles", layer.defines(), (tiles,),
-                [*layer.scalars(), *lists_read, features, job.read(layer.backgrounds), *shown, job.write(finite)],
+                [*layer.scalars(), *lists_read, features, backgrounds, *shown, job.write(finite)],
             )  # fmt: skip
             return image, coverage, finite
         defines = layer.defines()
@@ -99,14 +104,14 @@ def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
             job.launch(_PIXELS, "find_finite", defines, (geometry.points,), [count, features, finite_written])
         job.launch(
             _PIXELS, "composite_pixels", defines, (tiles * _GROUP, -(-layer.channels // layer.channel_group)),
-            [*layer.scalars(), *lists_read, finite_written, features, job.read(layer.backgrounds), *shown],
+            [*layer.scalars(), *lists_read, finite_written, features, backgrounds, *shown],
             (_GROUP, 1),
         )  # fmt: skip
     return image, coverage, finite
 
 
 def composite_backward(
-    layer: Layer, finite: Array, grad_image: Array, grad_coverage: Array, wanted: Wanted
+    layer: Layer, finite: Array, grad_image: Array, grad_coverage: Array | None, wanted: Wanted
 ) -> dict[str, Array]:
     """The wanted gradients, by name.
 
@@ -114,7 +119,7 @@ def composite_backward(
         layer: as in the forward.
         finite: from the forward.
         grad_image: [B, C, H, W] in any memory order; planes and channels-last are read in place.
-        grad_coverage: [B, H, W].
+        grad_coverage: [B, H, W]; None is zero.
         wanted: the gradients to compute.
     """
     geometry = layer.geometry
@@ -125,7 +130,8 @@ def composite_backward(
         "opacities": geometry.opacities.shape,
     }
     grads = {name: runtime.empty(shape, layer.dtype) for name, shape in shapes.items() if getattr(wanted, name)}
-    defines = layer.defines() | wanted.defines()
+    has = {"HAS_BACKGROUNDS": int(layer.backgrounds is not None), "HAS_GRAD_COVERAGE": int(grad_coverage is not None)}
+    defines = layer.defines() | wanted.defines() | has
     per_tile_count = len(layer.lists.tile_slots) * layer.channels if wanted.backgrounds else 1
     with layer.lists.session.job() as job:
         none = job.scratch(1, layer.dtype)
@@ -140,7 +146,7 @@ def composite_backward(
         launch = _launch_pixels_backward if layer.pixels else _launch_tiles_backward
         launch(job, layer, defines, finite, grad_image, grad_coverage, outputs, per_tile)
         if wanted.backgrounds:
-            grads["backgrounds"] = runtime.empty(layer.backgrounds.shape, layer.dtype)
+            grads["backgrounds"] = runtime.empty((geometry.batch, layer.channels), layer.dtype)
             job.launch(
                 _PIXELS if layer.pixels else _TILES, "sum_grad_backgrounds", defines,
                 (layer.channels, geometry.batch),
@@ -151,7 +157,7 @@ def composite_backward(
 
 def _launch_tiles_backward(
     job: runtime.Job, layer: Layer, defines: dict[str, str | int], finite: Array, grad_image: Array,
-    grad_coverage: Array, outputs: list[runtime.Buffer], per_tile: runtime.Buffer,
+    grad_coverage: Array | None, outputs: list[runtime.Buffer], per_tile: runtime.Buffer,
 ) -> None:  # fmt: skip
     geometry, lists = layer.geometry, layer.lists
     strides, grad_image = _strides(grad_image)
@@ -161,7 +167,8 @@ def _launch_tiles_backward(
     checkpoints = int(segments.sum()) if segments.max(initial=1) > 1 else 1
     inputs = [
         job.read(lists.tile_starts), lists.records, _read(job, layer.features),
-        *map(job.read, (layer.backgrounds, finite, grad_image, grad_coverage, checkpoint_starts)),
+        _read(job, layer.backgrounds), job.read(finite), job.read(grad_image), _read(job, grad_coverage),
+        job.read(checkpoint_starts),
         job.scratch(checkpoints * (constants.TILE + 1) ** 2, layer.dtype), job.scratch(checkpoints, np.int32),
     ]  # fmt: skip
     for phase, count in _phases(layer):
@@ -173,7 +180,7 @@ def _launch_tiles_backward(
 
 def _launch_pixels_backward(
     job: runtime.Job, layer: Layer, defines: dict[str, str | int], finite: Array, grad_image: Array,
-    grad_coverage: Array, outputs: list[runtime.Buffer], per_tile: runtime.Buffer,
+    grad_coverage: Array | None, outputs: list[runtime.Buffer], per_tile: runtime.Buffer,
 ) -> None:  # fmt: skip
     geometry, lists = layer.geometry, layer.lists
     strides, grad_image = _strides(grad_image)
@@ -186,7 +193,7 @@ def _launch_pixels_backward(
     job.launch(
         _PIXELS, "composite_pixels_backward", defines, (tiles * _GROUP,),
         [*layer.scalars(), *strides, *entries, _read(job, finite), _read(job, layer.features),
-         job.read(layer.backgrounds), grad, job.read(grad_coverage), weights, slot_grads, transmittance],
+         _read(job, layer.backgrounds), grad, _read(job, grad_coverage), weights, slot_grads, transmittance],
         (_GROUP,),
     )  # fmt: skip
     for phase, (columns, rows, batch) in _phases(layer):
@@ -212,9 +219,9 @@ def _phases(layer: Layer) -> Iterator[tuple[list[np.int32], tuple[int, int, int]
             yield [np.int32(n) for n in (x, y, step_x, step_y)], grid
 
 
-def _read(job: runtime.Job, array: Array) -> runtime.Buffer:
-    """A kernel argument even where there are no points."""
-    return job.read(array) if array.size else job.scratch(1, array.dtype)
+def _read(job: runtime.Job, array: Array | None) -> runtime.Buffer:
+    """A kernel argument, even where there is nothing that the kernel would read."""
+    return job.read(array) if array is not None and array.size else job.scratch(1, np.float64)
 
 
 def _strides(grad_image: Array) -> tuple[list[np.int64], Array]:

@@ -193,11 +193,10 @@ class _Composite(torch.autograd.Function):
         size = (layer.geometry.batch, layer.channels, layer.geometry.height, layer.geometry.width)
         if grad_image is None:
             grad_image = features.new_zeros(size)
-        if grad_coverage is None:
-            grad_coverage = features.new_zeros((size[0], *size[2:]))
         names = ("points_uv", "radii", "opacities", "features", "backgrounds")
         wanted = Wanted(**dict(zip(names, ctx.needs_input_grad[2:], strict=True)))
-        grads = composite_backward(layer, ctx.finite, grad_image.numpy(), as_array(grad_coverage), wanted)
+        cover = None if grad_coverage is None else as_array(grad_coverage)
+        grads = composite_backward(layer, ctx.finite, grad_image.numpy(), cover, wanted)
         shapes = {**ctx.shapes, "features": features.shape}
         tensors = (torch.from_numpy(grads[name]) if name in grads else None for name in names)
         shaped = (t if t is None else t.reshape(shapes.get(n, t.shape)) for n, t in zip(names, tensors, strict=True))
@@ -206,10 +205,7 @@ class _Composite(torch.autograd.Function):
 
 def _layer(raster: Raster[Any], features: Array, backgrounds: Array | None, min_transmittance: float) -> Layer:
     rows = as_array(features).reshape(-1, features.shape[-1])
-    if backgrounds is None:
-        behind = np.zeros((raster.geometry.batch, rows.shape[1]), rows.dtype)
-    else:
-        behind = as_array(backgrounds)
+    behind = None if backgrounds is None else as_array(backgrounds)
     return Layer(raster.geometry, raster.lists, rows, behind, min_transmittance)
 
 
