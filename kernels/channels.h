@@ -104,6 +104,13 @@ inline void add_row(const vector_t* blocks, global REAL* row) {
   store_row(sums, row);
 }
 
+inline void clear_row(global REAL* row) {
+  vector_t zeros[BLOCKS];
+#pragma unroll
+  for (int k = 0; k < BLOCKS; k++) zeros[k] = 0;
+  stream_row(zeros, row);
+}
+
 #if BUILTINS
 #define PREFETCH(pointer) __builtin_prefetch((const void*)(uintptr_t)(pointer), 0, 3)
 #else

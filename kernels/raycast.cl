@@ -16,6 +16,8 @@
 #include "raycast_things.h"
 #include "raycast_light.h"
 
+#define EDGE 0.09f  // how far from a car's edges its normal bends, metres
+
 #if TILE != LANES
 #error "a row of a tile must be LANES pixels"
 #endif
@@ -122,31 +124,67 @@ static void hit_foliage(
   }
 }
 
-static int face_of(global const solid_t* s, float3 unit)
+// The face of a box that a point of its surface is on, and how far outside each face's plane it is (zero or negative).
+static int face_of(global const solid_t* s, float3 unit, float* out)
 {
-  const float side = 0.5f * s->taper[0] * (1 - unit.y), front = 0.5f * s->taper[1] * (1 - unit.y);
-  const float back = 0.5f * s->taper[2] * (1 - unit.y);
-  const float out[6] = {unit.x + side, side - unit.x, unit.z + front, back - unit.z, -unit.y, unit.y};
+  const float rise = 0.5f * (1 - unit.y);
+  out[FACE_RIGHT] = unit.x - 1 + rise * s->taper[0];
+  out[FACE_LEFT] = -unit.x - 1 + rise * s->taper[0];
+  out[FACE_FRONT] = unit.z - 1 + rise * s->taper[1];
+  out[FACE_BACK] = -unit.z - 1 + rise * s->taper[2];
+  out[FACE_TOP] = -unit.y - 1;
+  out[FACE_BOTTOM] = unit.y - 1;
   int face = 0;
   for (int i = 1; i < 6; i++)
     if (out[i] > out[face]) face = i;
   return face;
 }
 
-// Outward normal in the solid's own axes: the gradient of its surface function, over half_size.
-static float3 normal_of(global const solid_t* s, float3 unit, int face)
+// Outward unit normal in the solid's own axes.
+static float3 face_normal(global const solid_t* s, int face)
 {
-  if (s->shape == SHAPE_ELLIPSOID) return unit;
-  if (s->shape == SHAPE_CYLINDER) return fabs(unit.y) > 0.999f ? (float3)(0, unit.y, 0) : (float3)(unit.x, 0, unit.z);
   const float side = -0.5f * s->taper[0], front = -0.5f * s->taper[1], back = -0.5f * s->taper[2];
+  const float3 scale = 1 / load3(s->half_size);
   switch (face) {
-    case FACE_RIGHT: return (float3)(1, side, 0);
-    case FACE_LEFT: return (float3)(-1, side, 0);
-    case FACE_FRONT: return (float3)(0, front, 1);
-    case FACE_BACK: return (float3)(0, back, -1);
+    case FACE_RIGHT: return normalize(scale * (float3)(1, side, 0));
+    case FACE_LEFT: return normalize(scale * (float3)(-1, side, 0));
+    case FACE_FRONT: return normalize(scale * (float3)(0, front, 1));
+    case FACE_BACK: return normalize(scale * (float3)(0, back, -1));
     case FACE_TOP: return (float3)(0, -1, 0);
     default: return (float3)(0, 1, 0);
   }
+}
+
+// A car's edges look round: near them its normal turns from face to face.
+static float3 bent_normal(global const solid_t* s, const float* out)
+{
+  const float3 reach = load3(s->half_size);
+  const float size[6] = {reach.x, reach.x, reach.z, reach.z, reach.y, reach.y};
+  float3 sum = 0;
+  for (int i = 0; i < 6; i++) {
+    const float weight = 1 + out[i] * size[i] / EDGE;
+    if (weight > 0) sum += weight * weight * face_normal(s, i);
+  }
+  return normalize(sum);
+}
+
+static bool is_car(int material)
+{
+  return material == MATERIAL_CAR_BODY || material == MATERIAL_CAR_PANEL || material == MATERIAL_CAR_CABIN;
+}
+
+// Face and normal of the solid at the point of its surface that hit->own holds.
+static void orient(global const solid_t* s, hit_t* hit)
+{
+  const float3 reach = load3(s->half_size), unit = hit->own / reach;
+  float3 normal = unit / reach;
+  if (s->shape == SHAPE_CYLINDER) normal = fabs(unit.y) > 0.999f ? (float3)(0, unit.y, 0) : (float3)(unit.x, 0, unit.z);
+  if (s->shape == SHAPE_BOX) {
+    float out[6];
+    hit->face = face_of(s, unit, out);
+    normal = is_car(s->material) ? bent_normal(s, out) : face_normal(s, hit->face);
+  }
+  hit->normal = normalize(to_world(s, normal));
 }
 
 static surface_t surface_of(const scene_t* scene, global const solid_t* solid, const hit_t* hit)
@@ -179,10 +217,8 @@ static float3 colour_of(const scene_t* scene, float3 ray, float s, int id)
   hit_t hit = {s * ray, (float3)(0), (float3)(0, -1, 0), s * view->pixel, 1, FACE_TOP};
   global const solid_t* solid = scene->solids + max(id, 0);
   if (id != ROAD) {
-    const float3 reach = load3(solid->half_size);
     hit.own = to_local(solid, hit.point - load3(solid->centre));
-    hit.face = solid->shape == SHAPE_BOX ? face_of(solid, hit.own / reach) : FACE_RIGHT;
-    hit.normal = normalize(to_world(solid, normal_of(solid, hit.own / reach, hit.face) / reach));
+    orient(solid, &hit);
   }
   if (dot(hit.normal, unit_ray) > 0) hit.normal = -hit.normal;  // the far side of a crown, from within
   hit.stretch = 1 / max(-dot(hit.normal, unit_ray), 0.03f);

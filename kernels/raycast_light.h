@@ -97,6 +97,6 @@ static float3 haze(float3 colour, float z)
 // Linear light to a display's [0, 1]: Narkowicz's fit of the ACES film curve, and gamma 2.
 static float3 display(float3 x)
 {
-  x = max(x * 0.80f, 0.0f);
+  x = max(x * 0.70f, 0.0f);
   return sqrt(clamp(x * (2.51f * x + 0.03f) / (x * (2.43f * x + 0.59f) + 0.14f), 0.0f, 1.0f));
 }

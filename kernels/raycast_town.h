@@ -163,7 +163,7 @@ static surface_t house(global const solid_t* solid, const hit_t* hit)
   } else if ((key & 3) == 0) {
     const float door = centred(x, 0.55f, footprint.x) * band(up, 0.1f, 2.4f, footprint.y);
     const float panel = centred(fabs(x) - 0.25f, 0.16f, footprint.x) * centred(fold(up - 0.7f, 1), 0.36f, footprint.y);
-    const float3 wood = (float3)(0.10f + 0.15f * random(5, 0, key), 0.07f, 0.05f + 0.1f * random(6, 0, key));
+    const float3 wood = mix((float3)(0.15f, 0.06f, 0.03f), (float3)(0.03f, 0.09f, 0.10f), random(5, 0, key));
     s.albedo = mix(s.albedo, wood * (1 - 0.4f * panel), door);
   } else {
     s = window(s, x, up - 1.1f, min(0.62f, 0.3f * cell), 1.7f, key, footprint);

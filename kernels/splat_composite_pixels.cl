@@ -21,6 +21,11 @@
 #ifndef TRUNCATE
 #error "define TRUNCATE as 0 or 1"
 #endif
+
+inline void clear_row(global REAL* row) {
+  for (int c = 0; c < CHANNELS; c++) row[c] = 0;
+}
+
 #include "splat_gradients.h"
 #define GROUP (TILE * TILE)
 

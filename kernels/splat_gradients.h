@@ -35,8 +35,7 @@ kernel void clear_gradients(
   for (int i = begin; i < end; i++) {
     if (is_in_one_tile(places[i])) continue;
 #if GRAD_FEATURES
-    global REAL* row = grad_features + (size_t)i * CHANNELS;
-    for (int c = 0; c < CHANNELS; c++) row[c] = 0;
+    clear_row(grad_features + (size_t)i * CHANNELS);
 #endif
     write_scalars(none, i, true, grad_points_uv, grad_radii, grad_opacities);
   }
