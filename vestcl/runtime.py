@@ -8,7 +8,6 @@ makes the results visible::
         job.launch("unproject.cl", "unproject", {"REAL": "float"}, (count,), [np.int32(count), job.read(depth), ...])
 """
 
-import collections
 import contextlib
 import contextvars
 import functools
@@ -112,8 +111,8 @@ def select(selector: str | None = None) -> DeviceInfo:
     """The device that ``selector`` means.
 
     Args:
-        selector: ``"0:1"`` (platform:device), or a part of the platform's, device's or driver's name in any case, such as
-            ``"pocl"``, ``"intel"``, ``"nvidia"``. None: the environment variable VESTCL_DEVICE, and without
+        selector: ``"0:1"`` (platform:device), or a part of the platform's, device's or driver's name in any case, such
+            as ``"pocl"``, ``"intel"``, ``"nvidia"``. None: the environment variable VESTCL_DEVICE, and without
             it the first PoCL (pip installs one), else the first CPU, else the first device.
 
     Raises:
@@ -187,7 +186,7 @@ def open_session(info: DeviceInfo, mapping: str) -> "Session":
 
 @functools.cache
 def kernel_folder() -> Path:
-    """Where the .cl files are: vestcl/kernels in a wheel, kernels/ beside the package in a checkout (editable or not)."""
+    """Where the .cl files are: vestcl/kernels in a wheel, kernels/ beside the package in a checkout."""
     package = Path(__file__).resolve().parent
     for folder in (package / "kernels", package.parent / "kernels"):
         if (folder / "common.h").is_file():
@@ -204,58 +203,6 @@ def source(name: str) -> str:
         included = re.fullmatch(r'\s*#include "(.+)"\s*', line)
         parts.append(f'{source(included[1])}\n#line {number + 1} "{name}"' if included else line)
     return "\n".join(parts)
-
-
-# ---------------------------------------------------------------- memory
-
-
-class _Block:
-    """Memory of an output array; it returns to the pool with the last array (or tensor) that shows it."""
-
-    def __init__(self, pool: "_HostPool", memory: np.ndarray) -> None:
-        self._pool, self._memory = pool, memory
-        start = -memory.ctypes.data % constants.CACHE_LINE
-        size = memory.nbytes - constants.CACHE_LINE
-        self.__array_interface__ = memory[start : start + size].__array_interface__
-
-    def __del__(self) -> None:
-        self._pool.give(self._memory)
-
-
-class _HostPool:
-    """Recycles large outputs. The C library returns theirs to the system, and the page faults of the next (5 ms for
-    the image of a 256 x 832 frame with 32 channels) cost more than the splat."""
-
-    def __init__(self) -> None:
-        self._free: collections.deque[np.ndarray] = collections.deque()
-        self._lock = threading.RLock()
-
-    def take(self, size: int) -> _Block:
-        with self._lock:
-            memory = next((free for free in self._free if free.nbytes == size + constants.CACHE_LINE), None)
-            if memory is not None:
-                self._free = collections.deque(free for free in self._free if free is not memory)
-        return _Block(self, np.empty(size + constants.CACHE_LINE, np.uint8) if memory is None else memory)
-
-    def give(self, memory: np.ndarray) -> None:
-        with self._lock:
-            self._free.append(memory)
-            while sum(free.nbytes for free in self._free) > constants.HOST_POOL_BYTES:
-                self._free.popleft()
-
-
-_host_pool = _HostPool()
-
-
-def empty(shape: Sequence[int], dtype: np.dtype[Any]) -> np.ndarray:
-    """An uninitialised array for an operator's output, aligned to cache lines; large ones are recycled."""
-    dtype = np.dtype(dtype)
-    size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
-    if size >= constants.HOST_POOL_FROM:
-        return np.asarray(_host_pool.take(size)).view(dtype).reshape(shape)
-    memory = np.empty(size + constants.CACHE_LINE, np.uint8)
-    start = -memory.ctypes.data % constants.CACHE_LINE
-    return memory[start : start + size].view(dtype).reshape(shape)
 
 
 # ---------------------------------------------------------------- sessions and jobs

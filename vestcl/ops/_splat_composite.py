@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from vestcl import constants, runtime
+from vestcl import constants, host_memory, runtime
 from vestcl.ops._splat_lists import Array, Geometry, TileLists, chunks_of
 
 #: Channels that a GPU's work-item keeps in registers; more are composited in groups.
@@ -82,8 +82,8 @@ class Layer:
 def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
     """Image [B, H, W, C] and coverage [B, H, W], and what the backward needs to know of features that aren't finite."""
     geometry, lists = layer.geometry, layer.lists
-    image = runtime.empty((geometry.batch, geometry.height, geometry.width, layer.channels), layer.dtype)
-    coverage = runtime.empty(image.shape[:3], layer.dtype)
+    image = host_memory.empty((geometry.batch, geometry.height, geometry.width, layer.channels), layer.dtype)
+    coverage = host_memory.empty(image.shape[:3], layer.dtype)
     tiles = len(lists.tile_slots)
     finite = np.ones(geometry.points if layer.pixels else tiles, np.int32)
     with lists.session.job() as job:
@@ -129,7 +129,7 @@ def composite_backward(
         "radii": geometry.radii.shape,
         "opacities": geometry.opacities.shape,
     }
-    grads = {name: runtime.empty(shape, layer.dtype) for name, shape in shapes.items() if getattr(wanted, name)}
+    grads = {name: host_memory.empty(shape, layer.dtype) for name, shape in shapes.items() if getattr(wanted, name)}
     has = {"HAS_BACKGROUNDS": int(layer.backgrounds is not None), "HAS_GRAD_COVERAGE": int(grad_coverage is not None)}
     defines = layer.defines() | wanted.defines() | has
     per_tile_count = len(layer.lists.tile_slots) * layer.channels if wanted.backgrounds else 1
@@ -146,7 +146,7 @@ def composite_backward(
         launch = _launch_pixels_backward if layer.pixels else _launch_tiles_backward
         launch(job, layer, defines, finite, grad_image, grad_coverage, outputs, per_tile)
         if wanted.backgrounds:
-            grads["backgrounds"] = runtime.empty((geometry.batch, layer.channels), layer.dtype)
+            grads["backgrounds"] = host_memory.empty((geometry.batch, layer.channels), layer.dtype)
             job.launch(
                 _PIXELS if layer.pixels else _TILES, "sum_grad_backgrounds", defines,
                 (layer.channels, geometry.batch),
@@ -159,7 +159,7 @@ def _launch_tiles_backward(
     job: runtime.Job, layer: Layer, defines: dict[str, str | int], finite: Array, grad_image: Array,
     grad_coverage: Array | None, outputs: list[runtime.Buffer], per_tile: runtime.Buffer,
 ) -> None:  # fmt: skip
-    geometry, lists = layer.geometry, layer.lists
+    lists = layer.lists
     strides, grad_image = _strides(grad_image)
     # A segment but the last has room for less than one more footprint, which bounds their number.
     segments = 1 + lists.tile_slots // (constants.SEGMENT - _GROUP)
