@@ -17,7 +17,8 @@ typedef struct { int x0, y0, x1, y1; } box_t;
 typedef struct { key_bits key, id; } entry_t;
 
 // One entry of a sorted tile list. box holds the footprint inside the tile, see pack_box.
-typedef struct { REAL u, v, r, r2, slope, o; int box, id; } record_t;
+// scale is 1 / r: distances in units of the radius neither overflow nor vanish where r * r would.
+typedef struct { REAL u, v, scale, o; int box, id; } record_t;
 
 // A footprint inside one tile, and whether it is the point's whole footprint.
 inline int pack_box(box_t box, bool whole) {

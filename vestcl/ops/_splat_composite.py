@@ -86,6 +86,8 @@ def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
     coverage = host_memory.empty(image.shape[:3], layer.dtype)
     tiles = len(lists.tile_slots)
     finite = np.ones(geometry.points if layer.pixels else tiles, np.int32)
+    if geometry.batch == 0:
+        return image, coverage, finite
     with lists.session.job() as job:
         features = _read(job, layer.features)
         backgrounds = job.read(layer.backgrounds_or_zero())
@@ -128,30 +130,26 @@ def composite_backward(
         "points_uv": geometry.points_uv.shape,
         "radii": geometry.radii.shape,
         "opacities": geometry.opacities.shape,
+        "backgrounds": (geometry.batch, layer.channels),
     }
     grads = {name: host_memory.empty(shape, layer.dtype) for name, shape in shapes.items() if getattr(wanted, name)}
+    if geometry.batch == 0:
+        return grads
     has = {"HAS_BACKGROUNDS": int(layer.backgrounds is not None), "HAS_GRAD_COVERAGE": int(grad_coverage is not None)}
     defines = layer.defines() | wanted.defines() | has
-    per_tile_count = len(layer.lists.tile_slots) * layer.channels if wanted.backgrounds else 1
+    file, launch = (_PIXELS, _launch_pixels_backward) if layer.pixels else (_TILES, _launch_tiles_backward)
     with layer.lists.session.job() as job:
         none = job.scratch(1, layer.dtype)
-        outputs = [job.write(grads[name]) if name in grads and grads[name].size else none for name in shapes]
-        per_tile = job.scratch(per_tile_count, layer.dtype)
+        *outputs, backgrounds = (job.write(grads[n]) if n in grads and grads[n].size else none for n in shapes)
+        per_tile = job.scratch(len(layer.lists.tile_slots) * layer.channels if wanted.backgrounds else 1, layer.dtype)
         if geometry.points:
+            clear: list[runtime.Argument] = [np.int32(geometry.points), layer.lists.places, *outputs]
             chunks = chunks_of(layer.lists.session, geometry.points, 1)
-            job.launch(
-                _PIXELS if layer.pixels else _TILES, "clear_gradients", defines, (chunks,),
-                [np.int32(geometry.points), layer.lists.places, *outputs],
-            )  # fmt: skip
-        launch = _launch_pixels_backward if layer.pixels else _launch_tiles_backward
+            job.launch(file, "clear_gradients", defines, (chunks,), clear)
         launch(job, layer, defines, finite, grad_image, grad_coverage, outputs, per_tile)
         if wanted.backgrounds:
-            grads["backgrounds"] = host_memory.empty((geometry.batch, layer.channels), layer.dtype)
-            job.launch(
-                _PIXELS if layer.pixels else _TILES, "sum_grad_backgrounds", defines,
-                (layer.channels, geometry.batch),
-                [np.int32(geometry.tiles), per_tile, job.write(grads["backgrounds"])],
-            )  # fmt: skip
+            total: list[runtime.Argument] = [np.int32(geometry.tiles), per_tile, backgrounds]
+            job.launch(file, "sum_grad_backgrounds", defines, (layer.channels, geometry.batch), total)
     return grads
 
 

@@ -84,13 +84,13 @@ def chunks_of(session: runtime.Session, points: int, counters: int) -> int:
 def list_tiles(session: runtime.Session, geometry: Geometry) -> TileLists:
     """Count each chunk's points per tile, list them by tile in order of their index, sort each list by depth."""
     defines = runtime.defines_for(geometry.z.dtype)
-    chunks = chunks_of(session, geometry.points // geometry.batch, geometry.tiles * geometry.batch)
-    spans = np.ones((geometry.batch, chunks), np.int32)
     tile_counts = np.zeros(geometry.batch * geometry.tiles, np.int32)
     with session.job() as job:
         places = job.scratch(geometry.points, np.int32)
         if geometry.points == 0:
             return _sort(job, geometry, _starts(tile_counts), 1, places, None)
+        chunks = chunks_of(session, geometry.points // geometry.batch, geometry.tiles * geometry.batch)
+        spans = np.ones((geometry.batch, chunks), np.int32)
         starts, points_uv, z, radii, opacities = (
             job.read(array)
             for array in (geometry.cloud_starts, geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
@@ -137,7 +137,7 @@ def _sort(
     """Sort every tile's entries by (z, index) into records. Without points there is nothing to sort."""
     count, tiles = int(tile_starts[-1]), len(tile_starts) - 1
     together = job.session.mapping == "pixel"
-    records = job.scratch(count, np.dtype(f"V{6 * geometry.z.dtype.itemsize + 8}"))
+    records = job.scratch(count, np.dtype(f"V{4 * geometry.z.dtype.itemsize + 8}"))
     slot_starts = job.scratch(count if together else 0, np.int64)
     tile_slots = np.zeros(tiles, np.int64)
     if entries is not None and count:

@@ -145,15 +145,11 @@ def composite(
     Args, returns and raises as in `splat`.
     """
     letters = "P C" if raster.packed else "B N C"
-    check(
-        **{
-            "raster.points_uv": (raster.points_uv, letters.replace("C", "2")),
-            "features": (features, letters),
-            "backgrounds": (backgrounds, f"{raster.geometry.batch} {features.shape[-1]} | None"),
-        }
-    )
-    if not 1 <= features.shape[-1] <= constants.MAX_CHANNELS:
-        raise ValueError(f"`features` must have 1 to {constants.MAX_CHANNELS} channels, got {features.shape[-1]}")
+    shapes = {"raster.points_uv": (raster.points_uv, letters.replace("C", "2")), "features": (features, letters)}
+    channels = check(**shapes)["C"]
+    check(**shapes, backgrounds=(backgrounds, f"{raster.geometry.batch} {channels} | None"))
+    if not 1 <= channels <= constants.MAX_CHANNELS:
+        raise ValueError(f"`features` must have 1 to {constants.MAX_CHANNELS} channels, got {channels}")
     if not 0 <= min_transmittance < 1:
         raise ValueError(f"`min_transmittance` must be in [0, 1), got {min_transmittance}")
     if not isinstance(features, torch.Tensor):
