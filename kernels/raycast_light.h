@@ -59,7 +59,8 @@ static float2 light_at(const scene_t* scene, float3 point, int own, bool ground)
     if (enter >= exit || exit <= 0.02f) continue;
     if (solid->material == MATERIAL_FOLIAGE) {
       const float3 from = point - load3(solid->centre);
-      if (is_gap(solid, to_local(solid, from + enter * sun)) && is_gap(solid, to_local(solid, from + exit * sun))) continue;
+      if (is_gap(solid, to_local(solid, from + enter * sun)) && is_gap(solid, to_local(solid, from + exit * sun)))
+        continue;
     }
     light.x = 0;
   }

@@ -40,7 +40,8 @@ static surface_t car_cabin(global const solid_t* solid, const hit_t* hit)
   if (hit->face >= FACE_TOP) return (surface_t){load3(solid->tint), CAR_PAINT, 0.0f};
   const bool side = hit->face == FACE_RIGHT || hit->face == FACE_LEFT;
   const float slope = hit->face == FACE_FRONT ? solid->taper[1] : solid->taper[2];
-  const float end = side ? reach.z * (1 - (at.z > 0 ? solid->taper[1] : solid->taper[2]) * up) : reach.x * (1 - solid->taper[0] * up);
+  const float end = side ? reach.z * (1 - (at.z > 0 ? solid->taper[1] : solid->taper[2]) * up)
+                         : reach.x * (1 - solid->taper[0] * up);
   const float along = side ? at.z : at.x;
   float glass = band(fabs(along), -1e3f, end - (side ? 0.13f : 0.07f), w) * band(up, 0.06f, 0.86f, w / (2 * reach.y));
   if (side) glass *= 1 - centred(along + 0.05f, 0.045f, w);
@@ -91,7 +92,8 @@ static surface_t person(global const solid_t* solid, const hit_t* hit)
   const float3 at = hit->own / load3(solid->half_size);
   if (solid->material == MATERIAL_HEAD) {
     const bool hair = at.y < -0.25f - 0.7f * at.z;
-    return (surface_t){hair ? (float3)(0.05f, 0.03f, 0.02f) * (1 + 2 * (float)(solid->seed & 3)) : load3(solid->tint), 0, 0};
+    const float3 hair_tint = (float3)(0.05f, 0.03f, 0.02f) * (1 + 2 * (float)(solid->seed & 3));
+    return (surface_t){hair ? hair_tint : load3(solid->tint), 0, 0};
   }
   const float folds = grain(hit->own.xy * (float2)(1, 0.4f), 0.06f, hit->footprint, solid->seed);
   return (surface_t){shaded(load3(solid->tint), 0.3f * folds), 0.0f, 0.0f};

@@ -48,7 +48,8 @@ static float markings(const scene_t* scene, float2 at, float2 footprint)
     const float out = fabs(at.y - middle) - reach;  // metres before the side street
     const float stripes = lines(at.x + 0.5f, 1, 0.5f, footprint.x) * centred(at.x, kerb - 0.3f, footprint.x);
     const float before = at.x > 0 ? at.y < middle : at.y > middle;
-    const float stop = before * centred(out - 5.2f, 0.2f, footprint.y) * centred(fabs(at.x) - 0.5f * lane, 0.45f * lane, 0.1f);
+    const float stop = before * centred(out - 5.2f, 0.2f, footprint.y) *
+                       centred(fabs(at.x) - 0.5f * lane, 0.45f * lane, 0.1f);
     const float share = 1 - band(out, -1e3f, 5.4f, footprint.y);
     paint = paint * share + stripes * centred(out - 2.7f, 1.5f, footprint.y) + stop;
   }
@@ -65,7 +66,8 @@ static surface_t road(const scene_t* scene, const hit_t* hit)
   const float paint = fabs(at.x) < view->kerb ? markings(scene, at, footprint) : 0;
   if (paint > 0) {
     const float width = sqrt(footprint.x * footprint.y);
-    const float worn = 0.62f + 0.18f * grain(at, 0.5f, width, view->seed + 7) + 0.2f * grain(at, 0.06f, width, view->seed + 8);
+    const float worn =
+        0.62f + 0.18f * grain(at, 0.5f, width, view->seed + 7) + 0.2f * grain(at, 0.06f, width, view->seed + 8);
     colour = mix(colour, (float3)(0.72f, 0.71f, 0.67f), paint * clamp(worn + 0.2f, 0.0f, 1.0f));
   }
   const float gutter = centred(fabs(at.x) - view->kerb + 0.15f, 0.15f, footprint.x);
@@ -149,8 +151,10 @@ static surface_t house(global const solid_t* solid, const hit_t* hit)
   const float level = up < ground ? -1 : min(floor((up - ground) / storey), storeys - 1);
   const uint key = hash((uint)(int)column, (uint)(int)level, seed + hit->face);
   const float plinth = band(up, 0, 0.6f, footprint.y);
-  const float course = centred(up - ground, 0.12f, footprint.y) + 0.8f * band(up, height - 0.5f, height - 0.1f, footprint.y);
-  const float under = band(up, ground - 0.5f, ground - 0.12f, footprint.y) + band(up, height - 0.9f, height - 0.5f, footprint.y);
+  const float course =
+      centred(up - ground, 0.12f, footprint.y) + 0.8f * band(up, height - 0.5f, height - 0.1f, footprint.y);
+  const float under =
+      band(up, ground - 0.5f, ground - 0.12f, footprint.y) + band(up, height - 0.9f, height - 0.5f, footprint.y);
   s.albedo = mix(s.albedo, (float3)(0.24f, 0.23f, 0.22f), 0.75f * plinth) * (1 - 0.3f * under);
   if (level >= 0) {
     const float y = up - ground - level * storey - 0.85f;

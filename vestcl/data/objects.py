@@ -13,7 +13,7 @@ from vestcl.data.raycast import SOLID, Label, Material, Shape, Solids
 Vector = tuple[float, float, float]
 
 _PAINTS: tuple[Vector, ...] = (
-    (0.62, 0.63, 0.62),
+    (0.50, 0.51, 0.50),
     (0.30, 0.32, 0.34),
     (0.055, 0.058, 0.064),
     (0.014, 0.014, 0.017),
@@ -81,7 +81,7 @@ def placed(solids: Solids, x: float, y: float, z: float, yaw: float = 0.0) -> So
 
 def _pick(rng: np.random.Generator, choices: Sequence[Vector], spread: float = 0.12) -> Vector:
     """One of ``choices``, a little lighter or darker."""
-    red, green, blue = choices[rng.integers(len(choices))]
+    red, green, blue = choices[int(rng.integers(len(choices)))]
     factor = 1 + spread * rng.uniform(-1, 1)
     return red * factor, green * factor, blue * factor
 
@@ -102,34 +102,36 @@ def car(rng: np.random.Generator) -> Solids:
         (Material.CAR_CABIN, shoulder, height, middle, (0.90 * side, half_cabin), (0.26, windscreen, hatch)),
     )
     parts = [
-        solid(
-            Shape.BOX, material, Label.CAR, (0.0, -(low + high) / 2, z), (x, (high - low) / 2, ahead), paint, taper
-        )
+        solid(Shape.BOX, material, Label.CAR, (0.0, -(low + high) / 2, z), (x, (high - low) / 2, ahead), paint, taper)
         for material, low, high, z, (x, ahead), taper in boxes
     ]
     for x in (-1, 1):
         for z in (-0.62, 0.62):
             at = (x * (side - 0.09), -0.32, z * reach)
-            parts.append(
-                solid(Shape.ELLIPSOID, Material.WHEEL, Label.CAR, at, (0.12, 0.32, 0.32), (0.02, 0.02, 0.02))
-            )
+            parts.append(solid(Shape.ELLIPSOID, Material.WHEEL, Label.CAR, at, (0.12, 0.32, 0.32), (0.02, 0.02, 0.02)))
         at = (x * (0.9 * side + 0.1), -shoulder - 0.08, middle + 0.62 * half_cabin)
         parts.append(solid(Shape.BOX, Material.CAR_PANEL, Label.CAR, at, (0.1, 0.07, 0.05), paint))
     return np.concatenate(parts)
 
 
 def tree(rng: np.random.Generator) -> Solids:
-    """A trunk and a crown of seven overlapping shells of leaves."""
+    """A trunk and a crown of ten overlapping shells of leaves."""
     top, radius = rng.uniform(4.6, 6.2), rng.uniform(0.12, 0.20)
     wood, green, spread = (0.115, 0.085, 0.06), _pick(rng, _LEAVES), rng.uniform(0.85, 1.15)
     trunk = solid(
-        Shape.CYLINDER, Material.BARK, Label.VEGETATION, (0, -top / 2, 0), (radius, top / 2, radius), wood, seed=_seed(rng)
+        Shape.CYLINDER,
+        Material.BARK,
+        Label.VEGETATION,
+        (0, -top / 2, 0),
+        (radius, top / 2, radius),
+        wood,
+        seed=_seed(rng),
     )
     parts = [trunk]
-    for i in range(7):
-        turn, out = i * 2.4 + rng.uniform(-0.4, 0.4), spread * (0.35 + 0.95 * np.sqrt(i / 6))
-        size = spread * rng.uniform(0.85, 1.25)
-        at = (out * np.cos(turn), -top + rng.uniform(-0.9, 0.9) - (1.1 if i == 0 else 0.0), out * np.sin(turn))
+    for i in range(10):
+        turn, out = i * 2.4 + rng.uniform(-0.4, 0.4), spread * (0.3 + 1.2 * np.sqrt(i / 9))
+        size = spread * rng.uniform(0.75, 1.1)
+        at = (out * np.cos(turn), -top - 0.7 + rng.uniform(-0.7, 0.7) + 0.5 * (out - 1), out * np.sin(turn))
         tint = _pick(rng, (green,), 0.2)
         half = (size, 0.85 * size, size)
         parts.append(solid(Shape.ELLIPSOID, Material.FOLIAGE, Label.VEGETATION, at, half, tint, seed=_seed(rng)))
@@ -195,9 +197,7 @@ def house(rng: np.random.Generator, depth: float, height: float, width: float) -
         rise = rng.uniform(2.2, 4.2)
         at, half = (0.0, -height - rise / 2, 0.0), (depth / 2 + 0.35, rise / 2, width / 2)
         hip = rng.choice([0.0, 0.0, 0.5])
-        parts.append(
-            solid(Shape.BOX, Material.ROOF, Label.BUILDING, at, half, tiles, (1.0, hip, hip), seed)
-        )
+        parts.append(solid(Shape.BOX, Material.ROOF, Label.BUILDING, at, half, tiles, (1.0, hip, hip), seed))
         top, size = -height - 0.8 * rise, (0.35, 0.9, 0.5)
         at = (depth * rng.uniform(-0.2, 0.2), top, width * rng.uniform(-0.3, 0.3))
         parts.append(solid(Shape.BOX, Material.PLAIN, Label.BUILDING, at, size, (0.24, 0.12, 0.09)))

@@ -105,7 +105,7 @@ class Street:
         return self.lane + self.parking
 
     def camera_pose(self, t: float) -> NDArray[np.float64]:
-        """world_from_camera [4,4] at time ``t`` in seconds: along the right lane, swaying gently, facing its heading."""
+        """world_from_camera [4,4] at time ``t`` seconds: along the right lane, swaying gently, facing its heading."""
         slow, fast = 0.45 * t + self.phase, 0.8 * t + self.phase
         z = self.speed * t + 0.8 * np.sin(fast)
         x = self.lane / 2 + 0.35 * np.sin(slow)
@@ -114,9 +114,7 @@ class Street:
         cos, sin = np.cos(yaw), np.sin(yaw)
         return np.array([[cos, 0, sin, x], [0, 1, 0, -CAMERA_HEIGHT], [-sin, 0, cos, z], [0, 0, 0, 1]])
 
-    def render(
-        self, camera_from_world: ArrayLike, K: ArrayLike, height: int, width: int, t: ArrayLike = 0.0
-    ) -> Frame:
+    def render(self, camera_from_world: ArrayLike, K: ArrayLike, height: int, width: int, t: ArrayLike = 0.0) -> Frame:
         """What cameras see at times ``t``.
 
         Args:

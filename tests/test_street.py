@@ -1,0 +1,135 @@
+"""The procedural street: geometry by hand, the same picture for a seed, and depth that agrees between cameras."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import vestcl
+from vestcl import runtime
+from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
+from vestcl.data.street import CAMERA_HEIGHT
+
+HEIGHT, WIDTH = 96, 320
+
+
+def look(street: Street, t: float = 0.0, tgt_from_cam: np.ndarray | None = None, **changes: Any) -> Any:
+    camera = np.linalg.inv(street.camera_pose(0.0))
+    arguments = {
+        "camera_from_world": camera if tgt_from_cam is None else tgt_from_cam @ camera,
+        "K": intrinsics(HEIGHT, WIDTH),
+        "height": HEIGHT,
+        "width": WIDTH,
+        "t": t,
+    }
+    return street.render(**(arguments | changes))
+
+
+def shift(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    moved = np.eye(4)
+    moved[:3, 3] = x, y, z
+    return moved
+
+
+def test_shapes_and_ranges(session: runtime.Session) -> None:
+    frame = look(Street.generate(0))
+    assert frame.colour.shape == (1, 3, HEIGHT, WIDTH)
+    assert frame.depth.shape == frame.labels.shape == (1, 1, HEIGHT, WIDTH)
+    assert frame.colour.min() >= 0
+    assert frame.colour.max() <= 1
+    assert set(np.unique(frame.labels)) <= {int(label) for label in Label}
+    assert {Label.ROAD, Label.SIDEWALK, Label.BUILDING, Label.SKY, Label.CAR} <= set(np.unique(frame.labels))
+
+
+def test_seed_decides(session: runtime.Session) -> None:
+    first, again, other = (look(Street.generate(seed)) for seed in (3, 3, 4))
+    assert np.array_equal(first.colour, again.colour)
+    assert np.array_equal(first.depth, again.depth)
+    assert not np.array_equal(first.colour, other.colour)
+
+
+def test_depth_of_the_road_by_hand(session: runtime.Session) -> None:
+    """A level camera sees flat road at z = h f / (v - cy)."""
+    frame, K = look(Street.generate(0)), intrinsics(HEIGHT, WIDTH)
+    rows, columns = np.nonzero(frame.labels[0, 0] == Label.ROAD)
+    by_hand = CAMERA_HEIGHT * K[1, 1] / (rows + 0.5 - K[1, 2])
+    near = by_hand < 30
+    assert near.sum() > 1000
+    assert np.abs(frame.depth[0, 0][rows, columns][near] / by_hand[near] - 1).max() < 1e-3
+
+
+def test_sky_is_far_and_only_sky_is(session: runtime.Session) -> None:
+    frame = look(Street.generate(1))
+    assert np.array_equal(frame.depth == SKY_DEPTH, frame.labels == Label.SKY)
+    assert frame.depth.min() > 0.1
+
+
+def test_a_camera_on_the_right_sees_things_further_left(session: runtime.Session) -> None:
+    """Points of the first camera, projected into the second, lie at the depth that is rendered there."""
+    street, K = Street.generate(0), torch.from_numpy(intrinsics(HEIGHT, WIDTH)).float()[None]
+    tgt_from_cam = shift(x=-0.5, z=-0.8)
+    here, there = look(street), look(street, tgt_from_cam=tgt_from_cam)
+    points = vestcl.unproject(torch.from_numpy(here.depth), K)
+    pose = torch.from_numpy(tgt_from_cam).float()[None]
+    uv, z = vestcl.displace(points, torch.zeros_like(points), K, pose)
+    column, row = uv[0].floor().long().unbind(-1)
+    seen = (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT) & (z[0] > 0.1) & (z[0] < 100)
+    depth = torch.from_numpy(there.depth)[0, 0][row[seen], column[seen]]
+    agrees = ((depth - z[0][seen]) / z[0][seen]).abs() < 0.05
+    assert float(agrees.float().mean()) > 0.9  # the rest is hidden from there, or at an edge
+    colours = torch.from_numpy(here.colour)[0].flatten(1)[:, seen][:, agrees]
+    matched = torch.from_numpy(there.colour)[0][:, row[seen][agrees], column[seen][agrees]]
+    assert float((colours - matched).abs().median()) < 0.03
+
+
+def test_time_moves_cars_and_nothing_else(session: runtime.Session) -> None:
+    now, later = look(Street.generate(0)), look(Street.generate(0), t=0.4)
+    changed = np.abs(now.depth - later.depth) > 0.05
+    assert changed.any()
+    movers = (Label.CAR, Label.PERSON)
+    assert np.isin(now.labels[changed], movers).all() or np.isin(later.labels[changed], movers).mean() > 0.5
+    building = (now.labels == Label.BUILDING) & (later.labels == Label.BUILDING)
+    assert np.array_equal(now.depth[building], later.depth[building])
+
+
+def test_batches_are_single_frames(session: runtime.Session) -> None:
+    street = Street.generate(2)
+    poses = np.stack([np.linalg.inv(street.camera_pose(t)) for t in (0.0, 0.5)])
+    both = look(street, camera_from_world=poses, t=np.array([0.0, 0.5]))
+    for i, t in enumerate((0.0, 0.5)):
+        alone = look(street, camera_from_world=poses[i], t=t)
+        assert np.array_equal(both.colour[i], alone.colour[0])
+        assert np.array_equal(both.depth[i], alone.depth[0])
+
+
+def test_drives_forward_and_stays_in_its_lane() -> None:
+    street = Street.generate(5)
+    poses = np.stack([street.camera_pose(t) for t in np.arange(0, 20, 0.1)])
+    steps = np.diff(poses[:, 2, 3])
+    assert steps.min() > 0.5
+    assert steps.max() < 1.5
+    assert np.abs(poses[:, 0, 3]).max() < street.lane
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"height": 0}, "`height` must be a positive integer, got 0"),
+        ({"width": 2.5}, "`width` must be a positive integer, got 2.5"),
+        ({"camera_from_world": np.eye(3)}, r"`camera_from_world` must be \[B, 4, 4\] or \[4, 4\], got \[3, 3\]"),
+        ({"camera_from_world": 2 * np.eye(4)}, "`camera_from_world` must be rigid"),
+        ({"K": np.eye(4)}, r"`K` must be \[1, 3, 3\] or \[3, 3\], got \[4, 4\]"),
+        ({"K": -np.eye(3)}, "`K` must have positive focal lengths"),
+        ({"t": float("nan")}, "`t` must be one or 1 finite times"),
+    ],
+)
+def test_refuses(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        look(Street.generate(0), **changes)
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, "0"])
+def test_refuses_seeds(seed: Any) -> None:
+    with pytest.raises(ValueError, match="`seed` must be a non-negative integer"):
+        Street.generate(seed)
