@@ -1,0 +1,1 @@
+"""Benchmarks, one a stem: `vestcl bench splat` is vestcl.bench.splat."""

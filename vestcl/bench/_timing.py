@@ -1,0 +1,174 @@
+"""Clocks: tasks timed in turns, so that what slows the machine down slows all of them, and copies as yardsticks."""
+
+import contextlib
+import ctypes
+import gc
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+Task = Callable[[], object]
+
+#: Rounds of a measurement whatever they take, and at most.
+LEAST_ROUNDS: Final = 5
+MOST_ROUNDS: Final = 200
+
+#: Seconds between two tasks. OpenMP's threads spin for some milliseconds after a parallel loop of torch's and would
+#: take a core from a task whose threads are not OpenMP's.
+PAUSE: Final = 0.01
+
+#: The share of the machine that other processes may keep busy before no target counts as reached or missed.
+QUIET_SHARE: Final = 0.05
+
+#: Of glibc's mallopt: the two parameters, what `recycling_allocator` sets, and glibc's defaults.
+_MMAP_MAX: Final = (-4, 0, 65536)
+_TRIM_THRESHOLD: Final = (-1, 2**31 - 1, 128 * 1024)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median and quartiles of some measurements."""
+
+    median: float
+    low: float
+    high: float
+    runs: int
+
+    @classmethod
+    def of(cls, values: NDArray[np.float64]) -> "Spread":
+        low, median, high = np.percentile(values, [25, 50, 75])
+        return cls(float(median), float(low), float(high), len(values))
+
+
+def interleave(tasks: Mapping[str, Task], seconds: float, least: int = LEAST_ROUNDS) -> dict[str, NDArray[np.float64]]:
+    """Run ``tasks`` in turns, A B C A B C ..., without garbage collection; the seconds of every run.
+
+    Args:
+        tasks: by name. Each runs twice before anything counts. Releasing what it returns is not timed.
+        seconds: about how long the measurement takes.
+        least: rounds that are run even if they take longer.
+    """
+    for task in (*tasks.values(), *tasks.values()):
+        task()
+    times: dict[str, list[float]] = {name: [] for name in tasks}
+    end = time.perf_counter() + seconds
+    with _no_collection():
+        for number in range(MOST_ROUNDS):
+            if number >= least and time.perf_counter() > end:
+                break
+            for name, task in tasks.items():
+                time.sleep(PAUSE)
+                start = time.perf_counter()
+                result = task()
+                times[name].append(time.perf_counter() - start)
+                del result
+    return {name: np.array(values) for name, values in times.items()}
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    enabled = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@contextlib.contextmanager
+def recycling_allocator() -> Iterator[bool]:
+    """Let glibc keep what is freed instead of returning it to the system, which costs torch a third of its time.
+
+    Yields whether it does; other C libraries are left as they are.
+    """
+    keeps = platform.libc_ver()[0] == "glibc"
+    mallopt: Any = ctypes.CDLL(None).mallopt if keeps else lambda *_: None
+    for parameter, value, _ in (_MMAP_MAX, _TRIM_THRESHOLD):
+        mallopt(parameter, value)
+    try:
+        yield keeps
+    finally:
+        for parameter, _, default in (_MMAP_MAX, _TRIM_THRESHOLD):
+            mallopt(parameter, default)
+
+
+@contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch compute with ``count`` threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def copies_of_forward(features: torch.Tensor, threads: int) -> dict[str, Task]:
+    """Features in, image out: ways to copy the features to memory that is there already, by name."""
+    to = torch.empty_like(features)
+    pairs, pool = _shares(threads, to, features), ThreadPoolExecutor(threads)
+    return {
+        "torch copy_": lambda: to.copy_(features),
+        "numpy copyto": lambda: list(pool.map(lambda pair: np.copyto(*pair), pairs)),
+    }
+
+
+def copies_of_backward(features: torch.Tensor, threads: int) -> dict[str, Task]:
+    """Features and the image's gradient in, the features' gradient out: ways to add two arrays into a third."""
+    grad, to = torch.ones_like(features), torch.empty_like(features)
+    triples, pool = _shares(threads, features, grad, to), ThreadPoolExecutor(threads)
+    return {
+        "torch add": lambda: torch.add(features, grad, out=to),
+        "numpy add": lambda: list(pool.map(lambda abc: np.add(abc[0], abc[1], out=abc[2]), triples)),
+    }
+
+
+def _shares(threads: int, *tensors: torch.Tensor) -> list[tuple[NDArray[Any], ...]]:
+    """The tensors' memory, one equal share a thread."""
+    return list(zip(*(np.array_split(tensor.numpy().reshape(-1), threads) for tensor in tensors), strict=True))
+
+
+@dataclass
+class Others:
+    """What `watching_others` saw."""
+
+    cores: float | None = None
+    """Cores that other processes kept busy; None where /proc does not tell."""
+
+
+@contextlib.contextmanager
+def watching_others() -> Iterator[Others]:
+    """Tell, when the ``with`` block ends, how busy other processes kept the machine meanwhile."""
+    others = Others()
+    start, before = time.perf_counter(), _others_seconds()
+    yield others
+    after, seconds = _others_seconds(), time.perf_counter() - start
+    if before is not None and after is not None:
+        others.cores = max(0.0, (after - before) / seconds)
+
+
+def is_quiet(others_cores: float | None) -> bool:
+    """Whether so busy a machine still gives honest ratios: threads that wait for each other suffer more than others."""
+    return others_cores is None or others_cores <= QUIET_SHARE * (os.cpu_count() or 1)
+
+
+def _others_seconds() -> float | None:
+    """CPU seconds that other processes have used since the machine started."""
+    try:
+        fields = Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0].split()[1:]
+    except OSError:
+        return None
+    user, nice, system, _, _, irq, softirq, steal = (int(field) for field in fields[:8])
+    total = (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
+    return total - time.process_time()
