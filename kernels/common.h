@@ -15,11 +15,11 @@
 #if REAL_BITS == 64
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 #define AS_KEY as_ulong
-#define REAL_MAX DBL_MAX
+#define SMALLEST DBL_MIN
 typedef ulong key_bits;
 #else
 #define AS_KEY as_uint
-#define REAL_MAX FLT_MAX
+#define SMALLEST FLT_MIN
 typedef uint key_bits;
 #endif
 

@@ -65,7 +65,7 @@ static float leaves(global const solid_t* solid, float3 own)
 }
 
 // A crown is a shell of leaves: rays pass where the noise is low.
-static bool is_gap(global const solid_t* solid, float3 own) { return leaves(solid, own) < 0.47f; }
+static bool is_gap(global const solid_t* solid, float3 own) { return leaves(solid, own) < 0.53f; }
 
 static surface_t foliage(global const solid_t* solid, const hit_t* hit)
 {
@@ -73,7 +73,7 @@ static surface_t foliage(global const solid_t* solid, const hit_t* hit)
   const float depth = 0.5f + 0.5f * dot(hit->own / load3(solid->half_size), (float3)(0, -1, 0));  // 1 on top, 0 below
   const float seen = visible(0.07f, hit->footprint);
   const float single = seen > 0 ? seen * (smoothstep(0.3f, 0.7f, noise3(hit->own * 19, solid->seed + 5)) - 0.5f) : 0;
-  const float3 colour = load3(solid->tint) * (0.4f + 2.2f * (leaf - 0.42f)) * (0.5f + 0.6f * depth);
+  const float3 colour = load3(solid->tint) * (0.4f + 2.2f * (leaf - 0.45f)) * (0.5f + 0.6f * depth);
   const float3 hue = (float3)(1 + 0.5f * single, 1, 1 - 0.4f * single);  // sunlit leaves are yellower
   return (surface_t){shaded(colour * hue, 0.8f * single), 0.0f, 0.4f};
 }

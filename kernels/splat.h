@@ -17,8 +17,7 @@ typedef struct { int x0, y0, x1, y1; } box_t;
 typedef struct { key_bits key, id; } entry_t;
 
 // One entry of a sorted tile list. box holds the footprint inside the tile, see pack_box.
-// scale is 1 / r: distances in units of the radius neither overflow nor vanish where r * r would.
-typedef struct { REAL u, v, scale, o; int box, id; } record_t;
+typedef struct { REAL u, v, r, r2, slope, o; int box, id; } record_t;
 
 // A footprint inside one tile, and whether it is the point's whole footprint.
 inline int pack_box(box_t box, bool whole) {
@@ -57,9 +56,11 @@ inline int area_of(box_t box) { return (box.x1 - box.x0) * (box.y1 - box.y0); }
 // Quads (2 x 2 pixels) that cover a footprint, from its first pixel on.
 inline int quads_in(box_t box) { return ((box.x1 - box.x0 + 1) >> 1) * ((box.y1 - box.y0 + 1) >> 1); }
 
-// Whether a point can make fragments: all its numbers finite, not in front of the near plane, some radius.
+// Whether a point can make fragments: all its numbers finite, not in front of the near plane, some radius. Where r^2
+// is no normal number (r below 1e-19 px or above 1e19 px in float32) the formula has no meaning.
 inline bool drawable(REAL u, REAL v, REAL z, REAL r, REAL o) {
-  return (u * 0 + v * 0 + z * 0 + r * 0 + o * 0 == 0) & (z >= (REAL)NEAR) & (r > 0);
+  const REAL r2 = r * r;
+  return (u * 0 + v * 0 + z * 0 + r2 * 0 + o * 0 == 0) & (z >= (REAL)NEAR) & (r > 0) & (r2 >= SMALLEST);
 }
 
 // Where a point's fragments are, as a number: its first tile, and how many rows and columns of tiles it has more.

@@ -122,10 +122,12 @@ inline record_t record_of(
   record_t record;
   record.u = points_uv[2 * id];
   record.v = points_uv[2 * id + 1];
-  record.scale = min(1 / radii[id], (REAL)REAL_MAX);
+  record.r = radii[id];
   record.o = opacities[id];
+  record.r2 = record.r * record.r;
+  record.slope = record.o / record.r2;
   record.id = id;
-  const box_t box = footprint(record.u, record.v, radii[id], height, width);
+  const box_t box = footprint(record.u, record.v, record.r, height, width);
   const box_t inside = {max(box.x0 - left, 0), max(box.y0 - top, 0), min(box.x1 - left, TILE), min(box.y1 - top, TILE)};
   record.box = pack_box(inside, area_of(inside) == area_of(box));
   return record;

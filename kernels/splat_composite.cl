@@ -1,6 +1,6 @@
 // Compositing, one work-item a tile: the mapping for CPUs.
 //
-// A pixel's fragments, front to back in the order (z, index), have a_i = o_i (1 - d2_i), d in radii, and
+// A pixel's fragments, front to back in the order (z, index), have a_i = o_i (1 - d2_i / r_i^2) and
 //   T_0 = 1,  w_i = a_i T_i,  T_(i+1) = T_i (1 - a_i),  image = sum_i w_i f_i + T_end b,  coverage = 1 - T_end.
 // The tile's list is in that order for every pixel, so the work-item walks it once, point by point, and adds into
 // the tile's pixels, which stay in the cache. The point's row of features is read once a tile, a few points
@@ -9,7 +9,7 @@
 // Backward, with g = dL/dimage and h = dL/dcoverage at a pixel, and no division by 1 - a:
 //   A_end = b.g - h,  A_i = a_i (f_i.g) + (1 - a_i) A_(i+1),  dL/da_i = T_i (f_i.g - A_(i+1)),
 //   dL/df_i = w_i g,  dL/db = sum over pixels of T_end g,
-//   da/du = 2 o dx / r,  da/dr = 2 o d2 / r,  da/do = 1 - d2,  where dx = (x + 0.5 - u) / r and d2 = dx^2 + dy^2.
+//   da/du = 2 o dx / r^2,  da/dr = 2 o d2 / r^3,  da/do = 1 - d2 / r^2,  where dx = x + 0.5 - u.
 // T_i needs a walk forward, A_i one backward. The forward one keeps a_i and T_i of SEGMENT fragments; a longer list
 // is cut into segments, whose first T are kept (a checkpoint), and each is walked again before it is walked back.
 //
@@ -113,11 +113,13 @@ inline int walk_forward(
     global const record_t* point = records + e;
     const box_t box = unpack_box(point->box);
     if (slot + quads_in(box) > SEGMENT / 4) break;
-    disc_t disc = disc_of(point, tile);
+    bool finite = true;
     if (!all_finite) {
       vector_t f[BLOCKS];
-      if (!load_row(features + (size_t)point->id * CHANNELS, f)) disc.u = REAL_MAX;  // reaches no pixel
+      finite = load_row(features + (size_t)point->id * CHANNELS, f);
     }
+    disc_t disc = disc_of(point, tile);
+    if (!finite) disc.r2 = 0;
     for (int y = box.y0; y < box.y1; y += 2)
       for (int x = box.x0; x < box.x1; x += 2, slot++) {
         const int p = y * STRIDE + x;
@@ -208,9 +210,7 @@ inline void walk_back(
         const REAL4 fg = sum_lanes_of_four(products), after = load_quad(behind, p);
         const REAL4 da = t * (fg - after);
         store_quad(a * fg + (1 - a) * after, behind, p);
-        // Where there is no fragment da is 0, but the distance may be infinite.
-        const REAL4 dx = t != 0 ? (x - disc.u) * disc.scale : (REAL4)0;
-        const REAL4 dy = t != 0 ? (y - disc.v) * disc.scale : (REAL4)0;
+        const REAL4 dx = x - disc.u, dy = y - disc.v;
         sum_da += da;
         sum_dx += da * dx;
         sum_dy += da * dy;
@@ -229,10 +229,10 @@ inline void walk_back(
     else stream_row(grad_f, row);
 #endif
 #if GRAD_GEOMETRY
-    const REAL d2 = sum_of_four(sum_d2), twice = 2 * point->o;
+    const REAL slope = 2 * point->slope, d2 = sum_of_four(sum_d2);
     const point_grads_t grads = {
-        twice * sum_of_four(sum_dx) * point->scale, twice * sum_of_four(sum_dy) * point->scale,
-        twice * d2 * point->scale, sum_of_four(sum_da) - d2};
+        slope * sum_of_four(sum_dx), slope * sum_of_four(sum_dy), slope * d2 / point->r,
+        sum_of_four(sum_da) - d2 / point->r2};
     write_scalars(grads, id, whole, grad_points_uv, grad_radii, grad_opacities);
 #endif
   }

@@ -30,9 +30,9 @@ inline void clear_row(global REAL* row) {
 #define GROUP (TILE * TILE)
 
 #if TRUNCATE
-#define EXISTS(d2, t) ((d2) < 1 && (t) >= min_transmittance)
+#define EXISTS(d2, r2, t) ((d2) < (r2) && (t) >= min_transmittance)
 #else
-#define EXISTS(d2, t) ((d2) < 1)
+#define EXISTS(d2, r2, t) ((d2) < (r2))
 #endif
 
 // One work-item a point: whether all its features are finite.
@@ -44,18 +44,12 @@ kernel void find_finite(const int points, global const REAL* restrict features, 
   finite[i] = zero == 0;
 }
 
-// Squared distance between a pixel's centre and a point, in units of the point's radius.
-inline REAL distance2(record_t point, int x, int y) {
-  const REAL dx = (x + (REAL)0.5 - point.u) * point.scale, dy = (y + (REAL)0.5 - point.v) * point.scale;
-  return dx * dx + dy * dy;
-}
-
-// The group copies entries [e, e + GROUP) of its list; those that make no fragment are put out of reach.
+// The group copies entries [e, e + GROUP) of its list; those that make no fragment get r2 = 0.
 inline void stage(
     local record_t* staged, int lane, int e, int end, global const record_t* records, global const int* finite) {
   if (e + lane < end) {
     record_t record = records[e + lane];
-    if (!finite[record.id]) record.u = REAL_MAX;
+    if (!finite[record.id]) record.r2 = 0;
     staged[lane] = record;
   }
 }
@@ -85,9 +79,9 @@ kernel void composite_pixels(
     barrier(CLK_LOCAL_MEM_FENCE);
     const int count = min(GROUP, end - e);
     for (int i = 0; i < count; i++) {
-      const REAL d2 = distance2(staged[i], x, y);
-      if (!EXISTS(d2, t)) continue;
-      const REAL a = staged[i].o - staged[i].o * d2, w = a * t;
+      const REAL dx = x + (REAL)0.5 - staged[i].u, dy = y + (REAL)0.5 - staged[i].v, d2 = dx * dx + dy * dy;
+      if (!EXISTS(d2, staged[i].r2, t)) continue;
+      const REAL a = staged[i].o - staged[i].slope * d2, w = a * t;
       global const REAL* row = features + (size_t)staged[i].id * CHANNELS + first;
       for (int c = 0; c < channels; c++) sums[c] += w * row[c];
       t *= 1 - a;
@@ -131,9 +125,9 @@ kernel void composite_pixels_backward(
   for (int e = begin; e < end; e++) {
     const box_t box = unpack_box(records[e].box);
     if (column < box.x0 || column >= box.x1 || line < box.y0 || line >= box.y1) continue;
-    const REAL d2 = distance2(records[e], x, y);
-    const bool exists = EXISTS(d2, t) && finite[records[e].id];
-    const REAL a = exists ? records[e].o - records[e].o * d2 : (REAL)0;
+    const REAL dx = x + (REAL)0.5 - records[e].u, dy = y + (REAL)0.5 - records[e].v, d2 = dx * dx + dy * dy;
+    const bool exists = EXISTS(d2, records[e].r2, t) && finite[records[e].id];
+    const REAL a = exists ? records[e].o - records[e].slope * d2 : (REAL)0;
     const size_t slot = tile_slot_starts[index] + slot_starts[e] + slot_in(box, column, line);
     slot_weights[slot] = exists ? t : (REAL)0;
     slot_grads[slot] = a;
@@ -208,16 +202,15 @@ kernel void sum_slots(
     for (int y = box.y0; y < box.y1; y++)
       for (int x = box.x0; x < box.x1; x++) {
         const REAL da = slot_grads[slots + slot_in(box, x, y)];
-        const REAL dx = (left + x + (REAL)0.5 - point.u) * point.scale;
-        const REAL dy = (top + y + (REAL)0.5 - point.v) * point.scale;
+        const REAL dx = left + x + (REAL)0.5 - point.u, dy = top + y + (REAL)0.5 - point.v;
         sum_da += da;
         sum_dx += da * dx;
         sum_dy += da * dy;
         sum_d2 += da * (dx * dx + dy * dy);
       }
-    const REAL twice = 2 * point.o;
     const point_grads_t grads = {
-        twice * sum_dx * point.scale, twice * sum_dy * point.scale, twice * sum_d2 * point.scale, sum_da - sum_d2};
+        2 * point.slope * sum_dx, 2 * point.slope * sum_dy, 2 * point.slope * sum_d2 / point.r,
+        sum_da - sum_d2 / point.r2};
     write_scalars(grads, point.id, whole, grad_points_uv, grad_radii, grad_opacities);
 #endif
   }

@@ -4,9 +4,9 @@
 #error "define TRUNCATE as 0 or 1"
 #endif
 #if TRUNCATE
-#define EXISTS(d2, t) (((d2) < 1) & ((t) >= min_transmittance))
+#define EXISTS(d2, r2, t) (((d2) < (r2)) & ((t) >= min_transmittance))
 #else
-#define EXISTS(d2, t) ((d2) < 1)
+#define EXISTS(d2, r2, t) ((d2) < (r2))
 #endif
 
 // A footprint is walked in quads: pixels p, p + 1, p + STRIDE, p + STRIDE + 1. A quad may reach one pixel beyond its
@@ -32,18 +32,18 @@ inline bool is_opaque(const REAL* transmittance, tile_t tile, REAL min_transmitt
   for (int y = 0; y < tile.height; y++)
     for (int x = 0; x < tile.width; x++) {
       const REAL t = transmittance[y * STRIDE + x];
-      open += EXISTS(0, t) & (t != 0);
+      open += EXISTS(0, 1, t) & (t != 0);
     }
   return open == 0;
 }
 
-// What a quad's alphas need of a point: u and v from each of its lanes, relative to the tile.
-typedef struct { REAL4 u, v; REAL scale, o; } disc_t;
+// What a quad's alphas need of a point, relative to the tile.
+typedef struct { REAL4 u, v; REAL r2, slope, o; } disc_t;
 
 inline disc_t disc_of(global const record_t* point, tile_t tile) {
   const disc_t disc = {
       point->u - tile.left - (REAL)0.5 - (REAL4)(0, 1, 0, 1), point->v - tile.top - (REAL)0.5 - (REAL4)(0, 0, 1, 1),
-      point->scale, point->o};
+      point->r2, point->slope, point->o};
   return disc;
 }
 
@@ -58,9 +58,9 @@ inline void store_quad(REAL4 quad, REAL* pixels, int p) {
 
 // Alphas of the quad at (x, y), and in *before the transmittances t: both 0 where there is no fragment.
 inline REAL4 quad_alphas(disc_t disc, int x, int y, REAL4 t, REAL min_transmittance, REAL4* before) {
-  const REAL4 dx = (x - disc.u) * disc.scale, dy = (y - disc.v) * disc.scale, d2 = dx * dx + dy * dy;
-  *before = EXISTS(d2, t) ? t : (REAL4)0;
-  return EXISTS(d2, t) ? disc.o - disc.o * d2 : (REAL4)0;
+  const REAL4 dx = x - disc.u, dy = y - disc.v, d2 = dx * dx + dy * dy;
+  *before = EXISTS(d2, disc.r2, t) ? t : (REAL4)0;
+  return EXISTS(d2, disc.r2, t) ? disc.o - disc.slope * d2 : (REAL4)0;
 }
 
 #ifdef GRAD_FEATURES
@@ -76,11 +76,10 @@ inline void load_grad_image(
   for (int y = 0; y < tile.height; y++) {
     global const REAL* row = grad_image + ((long)tile.b * height * width * CHANNELS) +
                              ((long)(tile.top + y) * width + tile.left) * pixel_stride;
-    REAL* to = (REAL*)grads[y * STRIDE];
     if (channel_stride == 1)
       for (int x = 0; x < tile.width; x++) {
         copy_row(row + x * pixel_stride, grads[y * STRIDE + x]);
-        for (int lane = 0; lane < OVERLAP; lane++) to[(x * BLOCKS + BLOCKS - 1) * VECTOR + lane] = 0;
+        for (int lane = 0; lane < OVERLAP; lane++) ((REAL*)&grads[y * STRIDE + x][BLOCKS - 1])[lane] = 0;
       }
     else
       for (int k = 0; k < BLOCKS; k++)
@@ -88,7 +87,7 @@ inline void load_grad_image(
           const bool again = k == BLOCKS - 1 && lane < OVERLAP;
           global const REAL* from = row + (BLOCK_START(k) + lane) * channel_stride;
           for (int x = 0; x < tile.width; x++)
-            to[(x * BLOCKS + k) * VECTOR + lane] = again ? (REAL)0 : from[x * pixel_stride];
+            ((REAL*)&grads[y * STRIDE + x][k])[lane] = again ? (REAL)0 : from[x * pixel_stride];
         }
   }
 }

@@ -137,7 +137,7 @@ def _sort(
     """Sort every tile's entries by (z, index) into records. Without points there is nothing to sort."""
     count, tiles = int(tile_starts[-1]), len(tile_starts) - 1
     together = job.session.mapping == "pixel"
-    records = job.scratch(count, np.dtype(f"V{4 * geometry.z.dtype.itemsize + 8}"))
+    records = job.scratch(count, np.dtype(f"V{6 * geometry.z.dtype.itemsize + 8}"))
     slot_starts = job.scratch(count if together else 0, np.int64)
     tile_slots = np.zeros(tiles, np.int64)
     if entries is not None and count:

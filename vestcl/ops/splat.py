@@ -54,8 +54,8 @@ def splat(
         image = sum_i w_i f_i + T_end b,   coverage = 1 - T_end
 
     Exact: any number of fragments a pixel, no epsilon, no division by 1 - a in the gradient, the same bits on any
-    number of cores. Points with z < 0.1 m, a radius <= 0 or any number that is not finite (a feature counts) are
-    skipped, and their gradients are 0.
+    number of cores. Points with z < 0.1 m, a radius <= 0 (or so extreme that its square is no normal number) or any
+    number that is not finite (a feature counts) are skipped, and their gradients are 0.
 
     Clouds of different sizes cost no padding when they are packed: concatenate the points of all clouds (without the
     leading B), and say in ``cloud_starts`` where each begins. Dense clouds padded with points of radius 0 work too; a
@@ -192,7 +192,7 @@ class _Composite(torch.autograd.Function):
         names = ("points_uv", "radii", "opacities", "features", "backgrounds")
         wanted = Wanted(**dict(zip(names, ctx.needs_input_grad[2:], strict=True)))
         cover = None if grad_coverage is None else as_array(grad_coverage)
-        grads = composite_backward(layer, ctx.finite, grad_image.numpy(), cover, wanted)
+        grads = composite_backward(layer, ctx.finite, grad_image.resolve_neg().numpy(), cover, wanted)
         shapes = {**ctx.shapes, "features": features.shape}
         tensors = (torch.from_numpy(grads[name]) if name in grads else None for name in names)
         shaped = (t if t is None else t.reshape(shapes.get(n, t.shape)) for n, t in zip(names, tensors, strict=True))

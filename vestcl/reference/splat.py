@@ -88,7 +88,7 @@ def _splat_cloud(
     layers = int(layer.max()) + 1 if len(layer) else 0
     alphas = alpha.new_zeros(layers, height * width).index_put((layer, pixel), alpha)
     if min_transmittance > 0:
-        taken = _transmittances(alphas.detach())[:-1] >= min_transmittance
+        taken = (_transmittances(alphas.detach())[:-1] >= min_transmittance).cumprod(dim=0).bool()
         alphas = torch.where(taken, alphas, 0)
     transmittances = _transmittances(alphas)
     weights = (alphas * transmittances[:-1])[layer, pixel]
