@@ -16,9 +16,13 @@ setup(
     install_requires=[
         "matplotlib>=3.8",
         "numpy>=1.26",
+        "opencv-contrib-python-headless>=4.10",
+        "OpenEXR>=3.3",
         "pillow>=10",
         "pyopencl[pocl]>=2024.2",
         "rich>=13",
+        "safetensors>=0.4",
+        "scikit-image>=0.24",
         "torch>=2.4",
         "tyro>=0.9",
     ],

@@ -158,16 +158,17 @@ def cast(
     inputs = (_view(scene, camera_from_world, K), scene.solids, crossings)
     with runtime.current().job() as job:
         view, solids, side_streets = (job.read(array) for array in inputs)
-        image_rects, shadow_rects = job.scratch(4 * count, np.int32), job.scratch(4 * count, np.int32)
+        image_rects, shadow_cells = job.scratch(4 * count, np.int32), job.scratch(4 * count, np.int32)
+        shadow_rects = job.scratch(4 * count, np.float32)
         tiles = [image_rects, *_lists(job, tile_rows * tile_columns, count)]
-        cell_lists = _lists(job, cells * cells, count)
+        shadows, cell_lists = [shadow_cells, shadow_rects], _lists(job, cells * cells, count)
         sizes = _int32(height, width, cells, cells)
-        _launch(job, "project_solids", (count,), [*sizes, view, solids, image_rects, shadow_rects])
+        _launch(job, "project_solids", (count,), [*sizes, view, solids, image_rects, *shadows])
         _launch(job, "list_solids", (tile_rows,), [*_int32(tile_columns, tile, count), *tiles])
-        _launch(job, "list_solids", (cells,), [*_int32(cells, 1, count), shadow_rects, *cell_lists])
+        _launch(job, "list_solids", (cells,), [*_int32(cells, 1, count), shadow_cells, *cell_lists])
         sizes = _int32(height, width, tile_columns, count, len(scene.crossings), cells, cells)
         outputs = [job.write(array[index]) for array in (frame.colour, frame.depth, frame.labels)]
-        arguments = [*sizes, view, solids, *tiles, *cell_lists, side_streets, *outputs]
+        arguments = [*sizes, view, solids, *tiles, shadow_rects, *cell_lists, side_streets, *outputs]
         _launch(job, "raycast", (tile_rows * tile_columns, tile), arguments, (1, tile))
 
 

@@ -1,26 +1,18 @@
 """The procedural street: an endless, seeded driving scene with exact colour, depth and labels at any time.
 
 World axes: x right, y down, z forward along the road, metres; the road is y = 0 and its centre line x = 0. Traffic
-keeps right. The street is built in blocks of BLOCK metres, each from the seed and its own index, so that any stretch
-of it can be built alone; moving cars and pedestrians walk in endless files of constant velocity.
+keeps right, and never ends: see vestcl/data/layout.py.
 """
 
-import functools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.data import objects
-from vestcl.data.raycast import Frame, Label, Material, Scene, Shape, Solids, blank_frame, cast
-
-#: Length of a block of the street in metres.
-BLOCK: Final = 48.0
-
-#: A side street's width in metres, at the end of its block.
-CROSSING: Final = 9.0
+from vestcl.data import layout
+from vestcl.data.layout import BLOCK, CROSSING, PAVEMENT_HEIGHT, File, Layout
+from vestcl.data.raycast import Frame, Material, Scene, blank_frame, cast
 
 #: How far ahead of the camera the street is built, metres: there the haze hides a house appearing.
 AHEAD: Final = 300.0
@@ -31,26 +23,8 @@ BEHIND: Final = 60.0
 #: The camera's height above the road in metres, as on KITTI's car.
 CAMERA_HEIGHT: Final = 1.65
 
-#: Height of the pavement above the road in metres.
-PAVEMENT_HEIGHT: Final = 0.12
-
 #: Focal length over image width, as in KITTI.
 FOCAL_SHARE: Final = 0.58
-
-
-@dataclass(frozen=True)
-class File:
-    """Cars or pedestrians that follow each other at constant velocity, one in each slot of ``spacing`` metres."""
-
-    tag: int
-    kind: str
-    """"car" or "pedestrian"."""
-    x: float
-    speed: float
-    """Metres a second along +z; negative walks and faces the other way."""
-    spacing: float
-    gap: int | None = None
-    """A slot that stays empty: the camera's own."""
 
 
 def intrinsics(height: int, width: int) -> NDArray[np.float64]:
@@ -141,27 +115,24 @@ class Street:
         position, forward = -rotation.T @ camera_from_world[:3, 3], rotation[2, 2]
         low = position[2] - (BEHIND if forward > 0.5 else AHEAD)
         high = position[2] + (BEHIND if forward < -0.5 else AHEAD)
-        parts, offsets = [], []
+        parts, offsets, plan = [], [], Layout(self.seed, self.kerb, self.pavement)
         blocks = range(int(low // BLOCK), int(high // BLOCK) + 1)
         for index in blocks:
-            parts.append(_block(self, index))
+            parts.append(layout.block(plan, index))
             offsets.append((0.0, 0.0, index * BLOCK))
         for file in self._files():
-            for solids, z in _members(self, file, t, low, high):
+            for solids, z in layout.members(plan, file, t, low, high):
                 parts.append(solids)
-                side_street = file.kind == "pedestrian" and self._is_crossing(z)
+                side_street = file.kind == "pedestrian" and layout.is_crossing(self.seed, z)
                 offsets.append((0.0, PAVEMENT_HEIGHT if side_street else 0.0, z))
         solids = np.concatenate(parts)
         counts = [len(part) for part in parts]
         solids["centre"] += np.repeat(np.array(offsets) - position, counts, axis=0)
         # Leaves last: their noise is looked up only where nothing nearer was hit.
         solids = solids[np.argsort(solids["material"] == Material.FOLIAGE, kind="stable")]
-        ends = [(index + 1) * BLOCK for index in blocks if _has_crossing(self.seed, index)]
+        ends = [(index + 1) * BLOCK for index in blocks if layout.has_crossing(self.seed, index)]
         crossings = np.array([(end - CROSSING, end) for end in ends], np.float32).reshape(-1, 2)
         return Scene(solids, crossings, self.sun, self.lane, self.kerb, self.seed)
-
-    def _is_crossing(self, z: float) -> bool:
-        return _has_crossing(self.seed, int(z // BLOCK)) and z % BLOCK > BLOCK - CROSSING
 
     def _files(self) -> tuple[File, ...]:
         walk = self.kerb + self.pavement
@@ -202,108 +173,3 @@ def _cameras(
     if not (sound and np.array_equal(cameras[:, 2], [[0, 0, 1]] * batch)):
         raise ValueError("`K` must have positive focal lengths and the last row (0, 0, 1)")
     return poses, cameras, np.broadcast_to(times, (batch,))
-
-
-# ---------------------------------------------------------------- what stands still
-
-
-def _rng(seed: int, purpose: int, index: int) -> np.random.Generator:
-    """A generator of its own for item ``index``, of either sign, of ``purpose``."""
-    return np.random.default_rng([seed, purpose, 2 * abs(index) + (index < 0)])
-
-
-@functools.lru_cache(maxsize=4096)
-def _has_crossing(seed: int, index: int) -> bool:
-    return bool(_rng(seed, 10, index).random() < 0.4)
-
-
-@functools.lru_cache(maxsize=256)
-def _block(street: Street, index: int) -> Solids:
-    """Everything that stands in block ``index``, z from the block's beginning."""
-    rng = _rng(street.seed, 11, index)
-    length = BLOCK - CROSSING if _has_crossing(street.seed, index) else BLOCK
-    after_crossing = _has_crossing(street.seed, index - 1)
-    parts: list[Solids] = []
-    for side in (-1, 1):
-        parts += _pavement(street, rng, side, length)
-        parts += _houses(street, rng, side, length)
-        parts += _furniture(street, rng, side, length, after_crossing)
-        if length < BLOCK:
-            parts += _side_street(street, rng, side, length)
-    return np.concatenate(parts)
-
-
-def _pavement(street: Street, rng: np.random.Generator, side: int, length: float) -> Iterator[Solids]:
-    half = (street.pavement / 2, PAVEMENT_HEIGHT / 2, length / 2)
-    centre = (side * (street.kerb + half[0]), -half[1], half[2])
-    grey = 0.30 + 0.06 * rng.random()
-    tint = (grey, 0.98 * grey, 0.94 * grey)
-    seed = int(rng.integers(1 << 32))
-    yield objects.solid(Shape.BOX, Material.PAVEMENT, Label.SIDEWALK, centre, half, tint, seed=seed)
-
-
-def _houses(street: Street, rng: np.random.Generator, side: int, length: float) -> Iterator[Solids]:
-    count = int(rng.integers(3, 6)) if length > 40 else int(rng.integers(3, 5))
-    widths = rng.uniform(0.75, 1.25, count)
-    widths *= length / widths.sum()
-    front = street.kerb + street.pavement
-    for width, end in zip(widths, np.cumsum(widths), strict=True):
-        depth, height = rng.uniform(11, 14), 4.2 + 3.1 * rng.integers(2, 5) + rng.uniform(0, 0.6)
-        home = objects.house(rng, depth, height, float(width))
-        yield objects.placed(home, side * (front + depth / 2 + rng.choice([0.0, 0.0, 0.35])), 0.0, end - width / 2)
-
-
-def _furniture(
-    street: Street, rng: np.random.Generator, side: int, length: float, after_crossing: bool
-) -> Iterator[Solids]:
-    """Trees, lamps and bollards along the kerb, and parked cars beside it."""
-    x = side * (street.kerb + 0.75)
-    for i, z in enumerate(np.arange(4.0, length - 2, 8.0)):
-        if i % 3 == 1:
-            yield objects.placed(objects.lamp(), x, -PAVEMENT_HEIGHT, z, 0.0 if side > 0 else np.pi)
-        elif rng.random() < 0.75:
-            yield objects.placed(objects.tree(rng), x, -PAVEMENT_HEIGHT, z + rng.uniform(-1, 1), rng.uniform(0, 6.3))
-    if length < BLOCK:
-        for z in (length - 1.2, length - 2.7):
-            yield objects.placed(objects.bollard(), side * (street.kerb + 0.4), -PAVEMENT_HEIGHT, z)
-    first = 9.0 if after_crossing else 3.5
-    for z in np.arange(first, length - (8.0 if length < BLOCK else 2.0), 6.2):
-        if rng.random() < 0.62:
-            yaw = (0.0 if side > 0 else np.pi) + rng.normal(0, 0.015)
-            middle = side * (street.kerb - 0.25 - 0.95 + rng.normal(0, 0.04))
-            yield objects.placed(objects.car(rng), middle, 0.0, z + rng.uniform(-0.5, 0.5), yaw)
-
-
-def _side_street(street: Street, rng: np.random.Generator, side: int, length: float) -> Iterator[Solids]:
-    """Houses that line the side street behind the corner houses, and one that closes its view."""
-    front = street.kerb + street.pavement + 11
-    middle = length + CROSSING / 2
-    for z in (middle - CROSSING / 2 - 6, middle + CROSSING / 2 + 6):
-        yield objects.placed(objects.house(rng, 24.0, rng.uniform(8, 12), 12.0), side * (front + 12), 0.0, z)
-    yield objects.placed(objects.house(rng, 12.0, rng.uniform(9, 14), 40.0), side * (front + 46), 0.0, middle)
-    for offset in (-2.5, 2.5):
-        yield objects.placed(objects.tree(rng), side * (front + 32), 0.0, middle + offset, rng.uniform(0, 6.3))
-
-
-# ---------------------------------------------------------------- what moves
-
-
-@functools.lru_cache(maxsize=1024)
-def _member(street: Street, file: File, slot: int) -> tuple[Solids, float]:
-    """Who walks or drives in ``slot``, and how far from the slot's middle."""
-    rng = _rng(street.seed, 20 + file.tag, slot)
-    yaw = 0.0 if file.speed > 0 else np.pi
-    car = file.kind == "car"
-    made = objects.car(rng) if car else objects.pedestrian(rng)
-    offset = 0.22 * file.spacing * rng.uniform(-1, 1)
-    return objects.placed(made, file.x + rng.uniform(-0.2, 0.2), 0.0 if car else -PAVEMENT_HEIGHT, 0.0, yaw), offset
-
-
-def _members(street: Street, file: File, t: float, low: float, high: float) -> Iterator[tuple[Solids, float]]:
-    """The members of ``file`` between z = ``low`` and ``high`` at time ``t``, with their z."""
-    start = file.speed * t
-    first, last = (int(np.floor((z - start) / file.spacing)) for z in (low, high))
-    for slot in range(first, last + 1):
-        if slot != file.gap:
-            solids, offset = _member(street, file, slot)
-            yield solids, slot * file.spacing + offset + start

@@ -1,0 +1,109 @@
+"""vestcl.models.config: models by name, and what they refuse to be."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from vestcl.models import CONFIGS, VARIANTS, EgoMotion, Encoder, ModelConfig, ObjectMotion, Refine, configuration
+from vestcl.models.config import EgoMotionConfig, ObjectMotionConfig, RefineConfig, RenderConfig, RoutingConfig
+
+
+def test_names() -> None:
+    assert list(CONFIGS) == ["vest-paper", "vest-s"]
+    for name, config in CONFIGS.items():
+        assert configuration(name) is config or configuration(name) == config
+        assert config.name == name
+
+
+def test_the_paper() -> None:
+    config = configuration("vest-paper")
+    assert config.encoder.features == 32
+    assert config.object_motion is not None and config.object_motion.shape == "paper"
+    assert config.object_motion.routing is None and config.fixed_depth is None
+    assert config.render.side_channels(32) == 37 and config.render.channels(32) == 74
+    assert not config.render.joint and not config.refine.residual
+
+
+def test_every_variant_changes_its_own_field() -> None:
+    changed: dict[str, Callable[[ModelConfig], Any]] = {
+        "fixed-depth": lambda c: c.fixed_depth == 20.0,
+        "no-emf": lambda c: c.ego_motion is None,
+        "no-omf": lambda c: c.object_motion is None,
+        "features-only": lambda c: not c.render.colour and c.render.channels(32) == 64,
+        "joint": lambda c: c.render.joint and c.render.channels(32) == 37,
+        "residual": lambda c: c.refine.residual,
+        "omf-paper": lambda c: c.object_motion.shape == "paper",
+        "omf-dmvfn": lambda c: c.object_motion.shape == "dmvfn",
+        "routing": lambda c: c.object_motion.routing == RoutingConfig(budget=4.5),
+    }
+    assert set(changed) == set(VARIANTS)
+    for base in CONFIGS:
+        for variant, holds in changed.items():
+            config = configuration(f"{base}+{variant}")
+            assert holds(config) and config.name == f"{base}+{variant}"
+            different = {
+                f.name for f in dataclasses.fields(config) if getattr(config, f.name) != getattr(CONFIGS[base], f.name)
+            }
+            assert len(different) <= 2  # the name, and the part that the variant is about
+
+
+def test_variants_add_up() -> None:
+    config = configuration("vest-s+joint+residual+no-emf+routing+omf-paper")
+    assert config.render.joint and config.refine.residual and config.ego_motion is None
+    assert config.object_motion is not None
+    assert config.object_motion.routing is not None and config.object_motion.shape == "paper"
+
+
+@pytest.mark.parametrize("name", ["vest-s", *(f"vest-s+{variant}" for variant in VARIANTS)])
+def test_the_parts_of_a_model_fit(name: str) -> None:
+    config = configuration(name)
+    features = Encoder(config.encoder)(torch.rand(1, 3, 16, 32))
+    channels, depth, mask = config.encoder.features, torch.rand(1, 1, 4, 8) * 50, torch.ones(1, 1, 4, 8)
+    assert features.shape[1] == channels
+    if config.ego_motion:
+        EgoMotion(config.ego_motion, channels)(features, features, depth, depth, mask, mask)
+    if config.object_motion:
+        network = ObjectMotion(config.object_motion, channels)
+        assert network(features, features, depth, depth, mask, mask, torch.rand(1, 6, 4, 8)).flow.shape == (1, 6, 4, 8)
+    refine = Refine(config.refine, config.render, channels)
+    assert refine(torch.rand(1, config.render.channels(channels), 16, 32)).shape == (1, 3, 16, 32)
+
+
+def test_frozen_and_hashable() -> None:
+    config = configuration("vest-s")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.fixed_depth = 3.0  # type: ignore[misc]
+    assert len({config, configuration("vest-s"), configuration("vest-paper")}) == 2
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: configuration("vest-xl"), "`name` must begin with one of vest-paper, vest-s, got 'vest-xl'"),
+        (lambda: configuration("vest-s+fast"), r"`name` may add \+fixed-depth, .*, \+routing, got '\+fast'"),
+        (lambda: configuration("vest-s+"), r"got '\+'"),
+        (lambda: configuration("vest-s+no-omf+routing"), "'vest-s' has no object motion to change"),
+        (lambda: configuration("vest-s+residual+features-only"), r"needs `render.colour`"),
+        (lambda: EgoMotionConfig(heads=3), r"`widths\[-1\]` must be a multiple of 4 `heads` = 12, got 256"),
+        (lambda: ObjectMotionConfig(shape="vgg"), '`shape` must be "paper" or "dmvfn", got \'vgg\''),  # type: ignore[arg-type]
+        (lambda: ObjectMotionConfig(scales=(4, 2)), r"`scales` and `widths` must be as long, got \(4, 2\)"),
+        (lambda: ObjectMotionConfig(scales=(), widths=()), "`scales` and `widths` must be as long"),
+        (lambda: ObjectMotionConfig(scales=(2,), widths=(42,)), "`widths` multiples of 4"),
+        (lambda: ObjectMotionConfig(scales=(0,), widths=(8,)), "`scales` must be >= 1"),
+        (
+            lambda: ObjectMotionConfig(routing=RoutingConfig(budget=9.0)),
+            r"`routing.budget` must be in \(0, 9\), got 9.0",
+        ),
+        (
+            lambda: ModelConfig("mine", refine=RefineConfig(residual=True), render=RenderConfig(colour=False)),
+            r"needs `render.colour`",
+        ),
+        (lambda: ModelConfig("mine", fixed_depth=0.0), r"`fixed_depth` must be in \[0.1, 1000.0\] m, got 0.0"),
+    ],
+)
+def test_refuses(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()

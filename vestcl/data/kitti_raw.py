@@ -1,0 +1,181 @@
+"""KITTI raw: DATE/DATE_drive_NNNN_sync/{image_0{0..3}/data/%010d.png, oxts/data/%010d.txt}, DATE/calib_*.txt.
+
+With the rectified projections P_rect_0i = K [I | p4_0i] every camera is the rectified camera 0 shifted by p4_0i =
+K^-1 P[:, 3], so right_from_left shifts by p4_03 - p4_02. Poses are those of the GPS/IMU box, carried into the camera:
+world_from_cam = world_from_imu imu_from_cam, cam_from_imu = cam_from_rect0 R_rect_00 cam0_from_velo velo_from_imu.
+"""
+
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vestcl.data import calibration, files
+from vestcl.data.calibration import Matrix
+from vestcl.data.files import Calibration
+from vestcl.data.sample import Clip, RightCamera, Sample
+from vestcl.data.sources import DepthFile, DepthSource, ImageFile
+from vestcl.io.atomic import read_bytes
+from vestcl.io.depth import KITTI_UNITS
+from vestcl.io.images import image_size
+
+#: Of the sphere that KITTI's Mercator projection is on, metres.
+EARTH_RADIUS: Final = 6378137.0
+
+#: Numbers in a line of oxts: latitude, longitude, altitude, roll, pitch, yaw and 24 more.
+OXTS_NUMBERS: Final = 30
+
+Rig = Literal["colour", "grey"]
+"""Which stereo pair: cameras 2 and 3, or 0 and 1."""
+
+RIGS: Final[dict[str, tuple[int, int]]] = {"colour": (2, 3), "grey": (0, 1)}
+
+
+@dataclass(frozen=True, eq=False)
+class VelodyneScan:
+    """A laser scan projected into a picture: depth of the nearest return in each pixel."""
+
+    path: Path
+    """float32 x, y, z, reflectance in the scanner's axes."""
+    cam_from_velo: Matrix
+    """[4, 4]."""
+    K: Matrix
+    """[3, 3] px, pixel centres at +0.5."""
+    height: int
+    width: int
+
+    def read(self) -> NDArray[np.float32]:
+        """[1, height, width] m, valid iff > 0; sparse, and seen through what is nearer, as the scanner sits higher.
+
+        Raises:
+            ValueError: no such file, or its length is not that of whole points.
+        """
+        content = read_bytes(self.path)
+        if len(content) % 16:
+            raise ValueError(f"{self.path}: must be float32 quadruples, got {len(content)} bytes")
+        scan = np.frombuffer(content, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
+        points = scan @ self.cam_from_velo[:3, :3].T + self.cam_from_velo[:3, 3]
+        points = points[points[:, 2] > 0]
+        u, v = (points[:, :2] / points[:, 2:] * self.K[[0, 1], [0, 1]] + self.K[:2, 2]).T
+        inside = (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
+        depth = np.full((1, self.height, self.width), np.inf, np.float32)
+        pixels = v[inside].astype(np.intp) * self.width + u[inside].astype(np.intp)
+        np.minimum.at(depth.reshape(-1), pixels, points[inside, 2].astype(np.float32))
+        return np.where(np.isfinite(depth), depth, np.float32(0))
+
+
+def open_kitti_raw(path: str | Path, rig: Rig = "colour", first_pose_identity: bool = True) -> Clip:
+    """A drive: left camera, right camera, poses, and depth where there is any.
+
+    Depth comes from `proj_depth/groundtruth/image_0i` of KITTI's depth set where that lies in the drive, else from
+    `velodyne_points`, else there is none (the pair gives it).
+
+    Args:
+        path: DATE/DATE_drive_NNNN_sync, with the date's calibration files beside it.
+        rig: the colour or the grey cameras.
+        first_pose_identity: the world is the first camera; otherwise the Mercator plane, far from its origin.
+
+    Raises:
+        ValueError: a file is missing or malformed; the message names it.
+
+    Source: SPEC section 9; devkit of KITTI raw (Geiger et al., IJRR 2013).
+    """
+    drive = Path(path)
+    if rig not in RIGS:
+        raise ValueError(f"`rig` must be colour or grey, got {rig!r}")
+    left, right = RIGS[rig]
+    frames = files.numbered_images(drive / f"image_{left:02}" / "data")
+    if not frames:
+        raise ValueError(f"{drive}: has no image_{left:02}/data/*.png")
+    cameras = Calibration(drive.parent / "calib_cam_to_cam.txt")
+    K, cam_from_rect0 = cameras.projection(f"P_rect_{left:02}")
+    size = image_size(next(iter(frames.values())))
+    poses = _poses(drive, list(frames), cam_from_rect0, cameras)
+    times = _times(drive / f"image_{left:02}" / "timestamps.txt", list(frames))
+    depths = _depths(drive, left, K, cam_from_rect0, size, cameras)
+    rights = _rights(drive, right, cam_from_rect0, cameras)
+    samples = []
+    for (number, frame), time, pose in zip(frames.items(), times, poses, strict=True):
+        image, depth, second = ImageFile(frame, *size), depths.get(number), rights.get(number)
+        samples.append(Sample(frame.stem, image, K, timestamp=time, world_from_cam=pose, depth=depth, right=second))
+    clip = Clip(drive.name, "KITTI raw", tuple(samples))
+    return clip.from_first_pose() if first_pose_identity else clip
+
+
+def mercator_pose(oxts: NDArray[np.float64], scale: float) -> Matrix:
+    """world_from_imu: tx = s er lon pi / 180, ty = s er ln tan((90 + lat) pi / 360), tz = alt, R = Rz Ry Rx.
+
+    Args:
+        oxts: [>= 6], latitude and longitude in degrees, altitude in metres, roll, pitch, yaw in radians.
+        scale: s = cos(lat) of the drive's first frame.
+
+    Returns:
+        [4, 4] m.
+    """
+    latitude, longitude, altitude, roll, pitch, yaw = oxts[:6]
+    x = scale * EARTH_RADIUS * np.radians(longitude)
+    y = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + latitude) / 2))
+    (sr, sp, sy), (cr, cp, cy) = np.sin([roll, pitch, yaw]), np.cos([roll, pitch, yaw])
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return calibration.rigid(about_z @ about_y @ about_x, (x, y, altitude))
+
+
+def _rights(drive: Path, right: int, left_from_rect0: Matrix, cameras: Calibration) -> dict[int, RightCamera]:
+    """By frame; none where the drive has no pictures of that camera."""
+    frames = files.numbered_images(drive / f"image_{right:02}" / "data", gaps=True)
+    if not frames:
+        return {}
+    K, right_from_rect0 = cameras.projection(f"P_rect_{right:02}")
+    right_from_left = right_from_rect0 @ calibration.invert(left_from_rect0)
+    size = image_size(next(iter(frames.values())))
+    return {number: RightCamera(ImageFile(frame, *size), K, right_from_left) for number, frame in frames.items()}
+
+
+def _poses(drive: Path, frames: list[int], cam_from_rect0: Matrix, cameras: Calibration) -> list[Matrix | None]:
+    """world_from_cam of every frame, in the Mercator plane; None for all where the drive has no oxts."""
+    folder = drive / "oxts" / "data"
+    if not folder.is_dir():
+        return [None] * len(frames)
+    velo_from_imu = Calibration(drive.parent / "calib_imu_to_velo.txt").rigid()
+    imu_from_cam = calibration.invert(cam_from_rect0 @ _rect0_from_velo(drive, cameras) @ velo_from_imu)
+    rows = [files.read_rows(folder / f"{frame:010}.txt", (OXTS_NUMBERS,))[0] for frame in frames]
+    scale = float(np.cos(np.radians(rows[0][0])))
+    return [mercator_pose(row, scale) @ imu_from_cam for row in rows]
+
+
+def _rect0_from_velo(drive: Path, cameras: Calibration) -> Matrix:
+    rectify = calibration.rigid(cameras.entry("R_rect_00", 9))
+    calibration.check_rigid(rectify, f"{cameras.path}: `R_rect_00`")
+    return rectify @ Calibration(drive.parent / "calib_velo_to_cam.txt").rigid()
+
+
+def _times(path: Path, frames: list[int]) -> list[float | None]:
+    """Seconds since the first frame; None for all where there is no such file."""
+    if not path.is_file():
+        return [None] * len(frames)
+    lines = files.read_lines(path)
+    try:  # nanoseconds are more than datetime takes
+        moments = [datetime.fromisoformat(lines[frame].strip()[:26]) for frame in frames]
+    except (ValueError, IndexError) as error:
+        raise ValueError(f"{path}: must have a date and time for each of {frames[-1] + 1} frames ({error})") from error
+    return [(moment - moments[0]).total_seconds() for moment in moments]
+
+
+def _depths(
+    drive: Path, left: int, K: Matrix, cam_from_rect0: Matrix, size: tuple[int, int], cameras: Calibration
+) -> dict[int, DepthSource]:
+    """By frame: KITTI's depth maps where there are any, else the laser scans."""
+    folder = drive / "proj_depth" / "groundtruth" / f"image_{left:02}"
+    maps = files.numbered_images(folder, gaps=True)
+    if maps:
+        return {number: DepthFile(path, KITTI_UNITS) for number, path in maps.items()}
+    scans = sorted((drive / "velodyne_points" / "data").glob("[0-9]*.bin"))
+    if not scans:
+        return {}
+    cam_from_velo = cam_from_rect0 @ _rect0_from_velo(drive, cameras)
+    return {int(path.stem): VelodyneScan(path, cam_from_velo, K, *size) for path in scans}

@@ -1,0 +1,140 @@
+"""One door to every reader: the layout on disk tells which one it is."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from vestcl.data import cityscapes, folder, kitti_odometry, kitti_raw, video, virtual_kitti
+from vestcl.data.sample import Clip, Sample
+from vestcl.data.sources import DepthFile, LabelFile
+from vestcl.io.labels import LabelKind
+
+#: Suffixes of files that are taken for videos.
+VIDEO_SUFFIXES: Final = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
+
+
+@dataclass(frozen=True)
+class _Layout:
+    name: str
+    looks_like: str
+    """What was looked for, for the message that nothing was found."""
+    recognises: Callable[[Path], bool]
+    opens: Callable[..., Clip]
+
+
+def _is_kitti_raw(path: Path) -> bool:
+    return any((path / f"image_{camera:02}" / "data").is_dir() for camera in (0, 2))
+
+
+def _is_kitti_odometry(path: Path) -> bool:
+    return (path / "sequences").is_dir() or (path / "calib.txt").is_file()
+
+
+def _is_cityscapes(path: Path) -> bool:
+    return cityscapes.is_frame(path) or bool(path.is_dir() and cityscapes.snippets(path))
+
+
+def _is_virtual_kitti(path: Path) -> bool:
+    return (path / "frames" / "rgb").is_dir() or bool(virtual_kitti.variants(path))
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and ((path / "camera.json").is_file() or bool(folder.frames_of(path)))
+
+
+#: In this order: the first that recognises a path opens it.
+_LAYOUTS: Final = (
+    _Layout(
+        "video",
+        f"a file ending in {', '.join(VIDEO_SUFFIXES)}",
+        lambda path: path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES,
+        video.open_video,
+    ),
+    _Layout("KITTI raw", "image_02/data (or image_00/data)", _is_kitti_raw, kitti_raw.open_kitti_raw),
+    _Layout("KITTI odometry", "calib.txt, or sequences/", _is_kitti_odometry, kitti_odometry.open_kitti_odometry),
+    _Layout(
+        "Cityscapes",
+        "leftImg8bit_sequence/SPLIT/CITY/*_leftImg8bit.png with camera/SPLIT/CITY/*_camera.json",
+        _is_cityscapes,
+        cityscapes.open_cityscapes,
+    ),
+    _Layout(
+        "Virtual KITTI 2", "frames/rgb (or VARIANT/frames/rgb)", _is_virtual_kitti, virtual_kitti.open_virtual_kitti
+    ),
+    _Layout("folder", "camera.json, or pictures (then give `fov`)", _is_folder, folder.open_folder),
+)
+
+
+def open_sequence(
+    path: str | Path,
+    *,
+    depth: str | Path | None = None,
+    depth_scale: float | None = None,
+    labels: str | Path | None = None,
+    label_ids: LabelKind = "trainIds",
+    **options: Any,
+) -> Clip:
+    """A clip of driving frames, whatever layout ``path`` has.
+
+    Args:
+        path: a KITTI raw drive, a KITTI odometry sequence, a frame or folder of Cityscapes, a Virtual KITTI variant,
+            a folder with camera.json, or a video.
+        depth: a folder of depth files with the frames' names (.png, .exr, .npy), in place of the clip's own.
+        depth_scale: their units per metre; PNG needs it.
+        labels: a folder of label PNGs with the frames' names, in place of the clip's own.
+        label_ids: what they hold.
+        **options: of the layout's reader: ``rig``, ``sequence``, ``snippet``, ``variant``, ``fov`` ...
+
+    Returns:
+        A clip with at least one sample.
+
+    Raises:
+        ValueError: there is nothing at ``path``, no layout or more than one clip in it, an option that its reader does
+            not have, or a file that is missing or malformed; the message names it.
+    """
+    path = Path(path)
+    layout = _recognise(path)
+    known = list(inspect.signature(layout.opens).parameters)[1:]
+    if unknown := sorted(set(options) - set(known)):
+        raise ValueError(f"{path}: is {layout.name}, which takes {', '.join(known)}, not {', '.join(unknown)}")
+    clip = layout.opens(path, **options)
+    if depth is not None:
+        clip = _with_depth(clip, Path(depth), depth_scale)
+    return clip if labels is None else _with_labels(clip, Path(labels), label_ids)
+
+
+def _recognise(path: Path) -> _Layout:
+    for layout in _LAYOUTS:
+        if layout.recognises(path):
+            return layout
+    if not path.exists():
+        raise ValueError(f"{path}: no such file or folder")
+    drives = sorted(drive.name for drive in path.glob("*_drive_*") if _is_kitti_raw(drive))
+    if drives:
+        raise ValueError(f"{path}: has KITTI raw drives; open one of {', '.join(drives)}")
+    wanted = "; ".join(f"{layout.name}: {layout.looks_like}" for layout in _LAYOUTS)
+    raise ValueError(f"{path}: is no clip that vestcl knows. It looked for {wanted}")
+
+
+def _with_depth(clip: Clip, where: Path, depth_scale: float | None) -> Clip:
+    def add(sample: Sample) -> Sample:
+        return replace(sample, depth=DepthFile(_named(where, sample, (".png", ".exr", ".npy")), depth_scale))
+
+    return replace(clip, samples=tuple(map(add, clip)))
+
+
+def _with_labels(clip: Clip, where: Path, label_ids: LabelKind) -> Clip:
+    def add(sample: Sample) -> Sample:
+        return replace(sample, labels=LabelFile(_named(where, sample, (".png",)), label_ids))
+
+    return replace(clip, samples=tuple(map(add, clip)))
+
+
+def _named(where: Path, sample: Sample, suffixes: tuple[str, ...]) -> Path:
+    for suffix in suffixes:
+        path = where / f"{sample.name}{suffix}"
+        if path.is_file():
+            return path
+    raise ValueError(f"{where}: has no {sample.name} ending in {', '.join(suffixes)}")

@@ -1,0 +1,277 @@
+"""What every reader gives: a clip of samples, one a frame, all typed and measured alike.
+
+A sample holds no pixels: it knows where they are and reads them when asked, at the sample's own size. So a drive of
+thousands of frames opens at once, and `Sample.resized` costs nothing but a K.
+"""
+
+import functools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, overload
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from vestcl import geometry
+from vestcl.data import calibration, resize
+from vestcl.data.sources import (
+    DepthArray,
+    DepthSource,
+    ImageArray,
+    ImageSource,
+    LabelArray,
+    LabelSource,
+    RegionSource,
+)
+from vestcl.io.labels import background
+
+
+@dataclass(frozen=True, eq=False)
+class RightCamera:
+    """The second camera of a stereo rig, at the same time."""
+
+    image: ImageSource
+    K: NDArray[np.float64]
+    """[3, 3] px, of a picture of ``size``."""
+    right_from_left: NDArray[np.float64]
+    """[4, 4] m; t_x is minus the baseline."""
+    size: tuple[int, int] | None = None
+    """(height, width) to read at; None is the picture's own."""
+
+    def __post_init__(self) -> None:
+        calibration.check_intrinsics(self.K, "right camera")
+        calibration.check_rigid(self.right_from_left, "right camera: right_from_left")
+
+    @property
+    def height(self) -> int:
+        """Px, of what `read_image` gives."""
+        return self.size[0] if self.size else self.image.height
+
+    @property
+    def width(self) -> int:
+        """Px, of what `read_image` gives."""
+        return self.size[1] if self.size else self.image.width
+
+    def read_image(self) -> NDArray[np.float32]:
+        """[3, height, width] RGB in [0, 1].
+
+        Raises:
+            ValueError: the file is missing, damaged or of another size than its clip.
+        """
+        return resize.resize_image(self.image.read(), self.height, self.width)
+
+    def resized(self, height: int, width: int) -> "RightCamera":
+        """The same camera at another size, with diag(sx, sy, 1) K."""
+        K = _scaled(self.K, width / self.width, height / self.height)
+        return replace(self, K=K, size=(height, width))
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One frame and what is known about it. Everything is over the same field of view, at ``height`` x ``width``."""
+
+    name: str
+    """Of the frame in its clip, "0000000012"."""
+    image: ImageSource
+    K: NDArray[np.float64]
+    """[3, 3] px, continuous coordinates (pixel centres at +0.5), of a picture of ``size``."""
+    size: tuple[int, int] | None = None
+    """(height, width) to read at; None is the picture's own."""
+    timestamp: float | None = None
+    """Seconds, from an arbitrary start."""
+    world_from_cam: NDArray[np.float64] | None = None
+    """[4, 4] m."""
+    depth: DepthSource | None = None
+    labels: LabelSource | None = None
+    """Where the background mask M comes from."""
+    ego_vehicle: RegionSource | None = None
+    """The recording car's own bonnet, where it is in the picture and known."""
+    right: RightCamera | None = None
+
+    def __post_init__(self) -> None:
+        calibration.check_intrinsics(self.K, f"sample {self.name}")
+        if self.world_from_cam is not None:
+            calibration.check_rigid(self.world_from_cam, f"sample {self.name}: world_from_cam")
+
+    @classmethod
+    def from_arrays(
+        cls,
+        name: str,
+        image: ArrayLike,
+        K: ArrayLike,
+        *,
+        depth: ArrayLike | None = None,
+        train_ids: ArrayLike | None = None,
+        world_from_cam: ArrayLike | None = None,
+        timestamp: float | None = None,
+    ) -> "Sample":
+        """A sample of arrays at hand.
+
+        Args:
+            name: of the frame.
+            image: [3, H, W] RGB in [0, 1].
+            K: [3, 3] px, pixel centres at +0.5.
+            depth: [1, H, W] m, valid iff > 0 and finite.
+            train_ids: [1, H, W] Cityscapes train ids.
+            world_from_cam: [4, 4] m.
+            timestamp: seconds.
+
+        Raises:
+            ValueError: an array of another shape, NaN in the image, or matrices that are no camera or no motion.
+        """
+        picture = _planes("image", image, np.float32, 3)
+        if np.isnan(picture).any():
+            raise ValueError("`image` must not have NaN")
+        metres = None if depth is None else _planes("depth", depth, np.float32, 1)
+        if metres is not None:
+            metres = np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0))
+        return cls(
+            name,
+            ImageArray(picture),
+            np.array(K, np.float64),
+            timestamp=timestamp,
+            world_from_cam=None if world_from_cam is None else np.array(world_from_cam, np.float64),
+            depth=None if metres is None else DepthArray(metres),
+            labels=None if train_ids is None else LabelArray(_planes("train_ids", train_ids, np.uint8, 1)),
+        )
+
+    @property
+    def height(self) -> int:
+        """Px, of whatever is read."""
+        return self.size[0] if self.size else self.image.height
+
+    @property
+    def width(self) -> int:
+        """Px, of whatever is read."""
+        return self.size[1] if self.size else self.image.width
+
+    def read_image(self) -> NDArray[np.float32]:
+        """[3, height, width] RGB in [0, 1]: mean over area where it shrinks, bilinear where it grows.
+
+        Raises:
+            ValueError: the file is missing, damaged or of another size than its clip.
+        """
+        return resize.resize_image(self.image.read(), self.height, self.width)
+
+    def read_depth(self) -> NDArray[np.float32]:
+        """[1, height, width] m, valid iff > 0: nearest valid source pixel, see `resize.resize_depth`.
+
+        Raises:
+            ValueError: the sample has no depth, or its file is missing, damaged or of other proportions.
+        """
+        return self._read(self.depth, "depth", resize.resize_depth)
+
+    def read_labels(self) -> NDArray[np.uint8]:
+        """[1, height, width] Cityscapes train ids, 255 = void, 10 = sky: nearest source pixel.
+
+        Raises:
+            ValueError: the sample has no labels, or their file is missing, damaged or of other proportions.
+        """
+        return self._read(self.labels, "labels", resize.resize_labels)
+
+    def read_mask(self) -> NDArray[np.bool_]:
+        """M [1, height, width], True = static background (SPEC section 3.2), from the labels.
+
+        Raises:
+            ValueError: as `read_labels`.
+        """
+        return background(self.read_labels())
+
+    def read_ego_vehicle(self) -> NDArray[np.bool_]:
+        """[1, height, width], True where the recording car itself is in the picture; nowhere if that is not known.
+
+        Raises:
+            ValueError: the file is missing, damaged or of other proportions.
+        """
+        if self.ego_vehicle is None:
+            return np.zeros((1, self.height, self.width), bool)
+        return self._read(self.ego_vehicle, "ego_vehicle", resize.resize_labels)
+
+    def resized(self, height: int, width: int) -> "Sample":
+        """The same frame at another size, anisotropic if need be: diag(sx, sy, 1) K, and everything read at it.
+
+        Args:
+            height: px.
+            width: px.
+
+        Raises:
+            ValueError: a size that is not a positive integer.
+        """
+        resize.check_size(height, width)
+        K = _scaled(self.K, width / self.width, height / self.height)
+        right = None if self.right is None else self.right.resized(height, width)
+        return replace(self, K=K, size=(height, width), right=right)
+
+    def _read(self, source: Any, name: str, resized: Callable[[Any, int, int], Any]) -> Any:
+        if source is None:
+            raise ValueError(f"sample {self.name} has no {name}; its clip comes without")
+        planes = source.read()
+        height, width = planes.shape[1:]
+        if abs(height * self.image.width / width - self.image.height) >= 1:  # a resize rounds by less than a pixel
+            where = getattr(source, "path", f"sample {self.name}: {name}")
+            wanted = f"{self.image.height} x {self.image.width}"
+            raise ValueError(f"{where}: must have the proportions of the picture, {wanted}, got {height} x {width}")
+        return resized(planes, self.height, self.width)
+
+
+@dataclass(frozen=True, eq=False)
+class Clip(Sequence[Sample]):
+    """Consecutive frames of one camera at a steady rate."""
+
+    name: str
+    kind: str
+    """The reader it comes from, "KITTI raw"."""
+    samples: tuple[Sample, ...]
+
+    def __post_init__(self) -> None:
+        if not self.samples:
+            raise ValueError(f"{self.name}: has no frames")
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    @overload
+    def __getitem__(self, index: int) -> Sample: ...
+    @overload
+    def __getitem__(self, index: slice) -> "Clip": ...
+    def __getitem__(self, index: int | slice) -> "Sample | Clip":
+        """A frame, or the clip of a slice (which must have a frame)."""
+        return replace(self, samples=self.samples[index]) if isinstance(index, slice) else self.samples[index]
+
+    def __iter__(self) -> Iterator[Sample]:
+        return iter(self.samples)
+
+    @functools.cached_property
+    def fps(self) -> float | None:
+        """Frames a second by the first and the last timestamp; None if they are not known."""
+        first, last = self.samples[0].timestamp, self.samples[-1].timestamp
+        if first is None or last is None or last <= first:
+            return None
+        return round((len(self) - 1) / (last - first), 6)  # 25, not 24.999999999999996
+
+    def resized(self, height: int, width: int) -> "Clip":
+        """All samples at another size, see `Sample.resized`."""
+        return self._mapped(sample.resized(height, width) for sample in self)
+
+    def from_first_pose(self) -> "Clip":
+        """The same clip with the first camera as world: first_from_world world_from_cam; without poses, itself."""
+        first = self.samples[0].world_from_cam
+        if first is None:
+            return self
+        poses = [None if s.world_from_cam is None else calibration.invert(first) @ s.world_from_cam for s in self]
+        return self._mapped(replace(s, world_from_cam=pose) for s, pose in zip(self, poses, strict=True))
+
+    def _mapped(self, samples: Iterable[Sample]) -> "Clip":
+        return replace(self, samples=tuple(samples))
+
+
+def _scaled(K: NDArray[np.float64], sx: float, sy: float) -> NDArray[np.float64]:
+    return geometry.scale_intrinsics(torch.from_numpy(K), sx, sy).numpy()
+
+
+def _planes(name: str, value: ArrayLike, dtype: type[np.generic], channels: int) -> NDArray[Any]:
+    planes = np.asarray(value).astype(dtype, copy=False)
+    if planes.ndim != 3 or len(planes) != channels or not planes.size:
+        raise ValueError(f"`{name}` must be [{channels}, H, W], got {list(planes.shape)}")
+    return planes

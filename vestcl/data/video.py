@@ -1,0 +1,29 @@
+"""A video file without calibration: a pinhole camera of a stated field of view, principal point in the middle."""
+
+from pathlib import Path
+from typing import Final
+
+from vestcl.data.calibration import intrinsics_from_fov
+from vestcl.data.sample import Clip, Sample
+from vestcl.data.sources import VideoFrame
+from vestcl.io.video import Video
+
+#: Horizontal field of view in degrees where none is told: between dashboard cameras that are sold as wide (their
+#: 120 to 140 degrees are diagonal, with distortion) and a telephone's main camera (65).
+FOV: Final = 60.0
+
+
+def open_video(path: str | Path, fov: float = FOV) -> Clip:
+    """A video's frames.
+
+    Args:
+        path: any file that OpenCV's ffmpeg decodes.
+        fov: horizontal field of view in degrees, between 0 and 180.
+
+    Raises:
+        ValueError: no such file, not decodable, or no such field of view.
+    """
+    video = Video(path)
+    K = intrinsics_from_fov(fov, video.height, video.width)
+    samples = (Sample(f"{i:06}", VideoFrame(video, i), K, timestamp=i / video.fps) for i in range(len(video)))
+    return Clip(Path(path).stem, "video", tuple(samples))

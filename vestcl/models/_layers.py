@@ -1,0 +1,103 @@
+"""What several networks share: shapes checked at the boundary, normalisation, exact resizing, depth as an input."""
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from vestcl.models.config import LOG_DEPTH_FAR, LOG_DEPTH_NEAR
+
+
+def check(**arguments: tuple[torch.Tensor, str]) -> dict[str, int]:
+    """Hold a network's arguments against their shapes; the sizes that the letters stand for.
+
+    Args:
+        **arguments: name = (tensor, shape), with the shape as words: a number is that size, a letter must mean the
+            same size, one or more, in all arguments (``mask_cur=(mask_cur, "B 1 H W")``).
+
+    Returns:
+        letter -> size.
+
+    Raises:
+        ValueError: no tensor of floating-point numbers, or one that does not fit its shape.
+    """
+    sizes: dict[str, int] = {}
+    for name, (value, shape) in arguments.items():
+        if not isinstance(value, torch.Tensor) or not value.is_floating_point():
+            got = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
+            raise ValueError(f"`{name}` must be a floating-point tensor, got {got}")
+        words = [int(word) if word.isdigit() else sizes.get(word, word) for word in shape.split()]
+        fits = len(words) == value.ndim and all(
+            size == word if isinstance(word, int) else size > 0 for word, size in zip(words, value.shape, strict=True)
+        )
+        if not fits:
+            raise ValueError(f"`{name}` must be [{', '.join(map(str, words))}], got {list(value.shape)}")
+        sizes |= {word: size for word, size in zip(shape.split(), value.shape, strict=True) if not word.isdigit()}
+    return sizes
+
+
+def channels_last(image: torch.Tensor) -> torch.Tensor:
+    """The same numbers with each pixel's channels side by side in memory: two to five times as fast on a CPU."""
+    return image.contiguous(memory_format=torch.channels_last)
+
+
+def group_norm(channels: int, per_group: int) -> nn.GroupNorm:
+    """GroupNorm with groups of at least ``per_group`` channels, all alike; one group where there are fewer."""
+    groups = max(1, channels // per_group)
+    while channels % groups:
+        groups -= 1
+    return nn.GroupNorm(groups, channels)
+
+
+def upsample(image: torch.Tensor, factor: int, height: int, width: int) -> torch.Tensor:
+    """Bilinear by a whole factor, then cut at the right and at the bottom to height x width.
+
+    Cell k comes to cover [factor k, factor (k + 1)) whatever the size, so odd sizes move nothing.
+
+    Args:
+        image: [B, C, h, w] with factor h >= height and factor w >= width.
+        factor: enlargement.
+        height: rows out.
+        width: columns out.
+
+    Returns:
+        [B, C, height, width]; differentiable.
+    """
+    if factor > 1:
+        image = functional.interpolate(image, scale_factor=factor, mode="bilinear", align_corners=False)
+    return image[..., :height, :width]
+
+
+def frame_pair(
+    features_prev: torch.Tensor,
+    features_cur: torch.Tensor,
+    depth_prev: torch.Tensor,
+    depth_cur: torch.Tensor,
+    mask_prev: torch.Tensor,
+    mask_cur: torch.Tensor,
+    channels: int,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What the motion networks see of two frames: [F, log(clamp(D)), M] of each.
+
+    Args:
+        features_prev: [B, channels, H, W] at t - 1.
+        features_cur: the same at t.
+        depth_prev: [B, 1, H, W] m; clamped to [LOG_DEPTH_NEAR, LOG_DEPTH_FAR].
+        depth_cur: the same at t.
+        mask_prev: [B, 1, H, W], 1 on the static background.
+        mask_cur: the same at t.
+        channels: that the features must have.
+
+    Returns:
+        Two [B, channels + 2, H, W]; differentiable in all.
+
+    Raises:
+        ValueError: an argument of another shape.
+    """
+    wanted, one = f"B {channels} H W", "B 1 H W"
+    check(
+        features_prev=(features_prev, wanted), features_cur=(features_cur, wanted),
+        depth_prev=(depth_prev, one), depth_cur=(depth_cur, one),
+        mask_prev=(mask_prev, one), mask_cur=(mask_cur, one),
+    )  # fmt: skip
+    log_prev, log_cur = (depth.clamp(LOG_DEPTH_NEAR, LOG_DEPTH_FAR).log() for depth in (depth_prev, depth_cur))
+    return torch.cat([features_prev, log_prev, mask_prev], dim=1), torch.cat([features_cur, log_cur, mask_cur], dim=1)

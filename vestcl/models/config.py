@@ -1,0 +1,222 @@
+"""Every size and choice of the networks, frozen. `configuration` knows them by name: "vest-s+no-omf+joint".
+
+    vest-paper              the paper's widths
+    vest-s                  widths that two CPU cores train
+    +fixed-depth            ablation A of the paper: every pixel at FIXED_DEPTH
+    +no-emf  +no-omf        ablations B and C: without ego-motion, without object motion
+    +features-only          the paper's literal 32 rendered channels: features and nothing else
+    +joint                  both clouds splatted together in one depth-ordered pass
+    +residual               refinement adds to the splatted colour instead of painting anew
+    +omf-paper  +omf-dmvfn  the two published shapes of object motion
+    +routing                a small network picks which blocks of object motion run
+
+Source: SPEC sections 3 to 7.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, Literal
+
+from vestcl import constants
+
+#: Depth goes into the networks as log(metres), clamped from below where the splatter stops drawing ...
+LOG_DEPTH_NEAR: Final = constants.NEAR
+#: ... and from above where, for a car's camera, everything is equally far: 1 km moves less than a pixel a frame.
+LOG_DEPTH_FAR: Final = 1000.0
+
+#: Depth of every pixel in the ablation "fixed depth", metres: about the median of a street seen from a car.
+FIXED_DEPTH: Final = 20.0
+
+#: Channels a group of GroupNorm: encoder (of 1 to 64 that its authors tried on ImageNet, 16 were the best) ...
+ENCODER_GROUP: Final = 16
+#: ... and refinement (as in 3D Moments).
+REFINE_GROUP: Final = 32
+
+#: The footprint's radius in source pixels (3D Moments): for features that a network then refines.
+RHO: Final = 1.5
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """Residual trunk and decoder. The defaults are ResNet34 without layer4, whose public weights then fit."""
+
+    widths: tuple[int, int, int] = (64, 128, 256)
+    """Channels of layers 1 to 3; the stem has those of layer 1."""
+    blocks: tuple[int, int, int] = (3, 4, 6)
+    """Residual blocks of layers 1 to 3."""
+    decoder: tuple[int, int] = (128, 64)
+    """Channels of the decoder at H/8 and, before layer 1 joins it, at H/4."""
+    features: int = 32
+    """Channels out."""
+
+
+@dataclass(frozen=True)
+class EgoMotionConfig:
+    """Convolutions shared over both frames, then self-attention over what they give."""
+
+    widths: tuple[int, int, int, int] = (64, 64, 128, 128)
+    """Channels of the four convolutions; a token has twice the last."""
+    blocks: int = 2
+    """Self-attention blocks."""
+    heads: int = 4
+    mlp_ratio: int = 4
+    """Hidden units of a block's MLP over channels of a token."""
+
+    def __post_init__(self) -> None:
+        if (channels := 2 * self.widths[-1]) % (4 * self.heads):
+            raise ValueError(f"2 `widths[-1]` must be a multiple of 4 `heads` = {4 * self.heads}, got {channels}")
+
+
+@dataclass(frozen=True)
+class RoutingConfig:
+    """Which blocks of object motion run for which scene (DMVFN)."""
+
+    width: int = 32
+    """Channels of the two convolutions."""
+    budget: float = 4.5
+    """Blocks that should run on average."""
+    rule: Literal["threshold", "top"] = "threshold"
+    """Blocks that run outside training: of probability 1/2 and more, or the (rounded) budget's most probable."""
+
+
+@dataclass(frozen=True)
+class ObjectMotionConfig:
+    """A cascade of multi-scale motion-flow blocks, one for each entry of ``scales`` and ``widths``."""
+
+    shape: Literal["paper", "dmvfn"] = "paper"
+    """"paper" keeps each block's resolution (ReLU); "dmvfn" works at a quarter of it (PReLU) and costs a tenth."""
+    scales: tuple[int, ...] = (4, 4, 4, 2, 2, 2, 1, 1, 1)
+    """Branch A of block i sees its input shrunk by scales[i]."""
+    widths: tuple[int, ...] = (160, 160, 160, 80, 80, 80, 44, 44, 44)
+    """Channels of branch A; multiples of 4."""
+    detail: int = 8
+    """Channels of branch B, at full resolution."""
+    routing: RoutingConfig | None = None
+    """None runs every block."""
+
+    def __post_init__(self) -> None:
+        if self.shape not in ("paper", "dmvfn"):
+            raise ValueError(f'`shape` must be "paper" or "dmvfn", got {self.shape!r}')
+        if not self.scales or len(self.scales) != len(self.widths):
+            raise ValueError(f"`scales` and `widths` must be as long, got {self.scales} and {self.widths}")
+        if min(self.scales) < 1 or any(width % 4 or width < 4 for width in self.widths):
+            raise ValueError(f"`scales` must be >= 1, `widths` multiples of 4, got {self.scales} and {self.widths}")
+        if self.routing and not 0 < self.routing.budget < len(self.scales):
+            raise ValueError(f"`routing.budget` must be in (0, {len(self.scales)}), got {self.routing.budget}")
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """What the clouds carry to the new view, and how they are splatted."""
+
+    colour: bool = True
+    """Colour, coverage and inverse depth beside the features; False renders features alone."""
+    joint: bool = False
+    """Both clouds in one depth-ordered pass; False renders each on its own, previous frame first."""
+    rho: float = RHO
+    """Radius in source pixels."""
+
+    def side_channels(self, features: int) -> int:
+        """Channels of one rendered image: features, and then colour 3, coverage 1, inverse depth 1 (1/m)."""
+        return features + 5 if self.colour else features
+
+    def channels(self, features: int) -> int:
+        """Channels that go into refinement: both sides, or the joint one."""
+        return self.side_channels(features) * (1 if self.joint else 2)
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """U-Net from rendered channels to the image."""
+
+    stem: int = 32
+    """Channels at full resolution."""
+    stem_kernel: int = 7
+    widths: tuple[int, ...] = (64, 128, 256, 512)
+    """Channels at H/2, H/4, ...; the bottleneck has the last."""
+    residual: bool = False
+    """Add to coverage x splatted colour; False paints the image through a sigmoid."""
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The whole model."""
+
+    name: str
+    encoder: EncoderConfig = EncoderConfig()
+    ego_motion: EgoMotionConfig | None = EgoMotionConfig()
+    """None: cameras are taken to stand still, and object motion has to explain it all."""
+    object_motion: ObjectMotionConfig | None = ObjectMotionConfig()
+    """None: all points follow the camera's motion."""
+    render: RenderConfig = RenderConfig()
+    refine: RefineConfig = RefineConfig()
+    fixed_depth: float | None = None
+    """Metres, for every pixel; None uses the depth that comes in."""
+
+    def __post_init__(self) -> None:
+        if self.refine.residual and not self.render.colour:
+            raise ValueError("`refine.residual` adds to the rendered colour, so it needs `render.colour`")
+        if self.fixed_depth is not None and not LOG_DEPTH_NEAR <= self.fixed_depth <= LOG_DEPTH_FAR:
+            raise ValueError(f"`fixed_depth` must be in [{LOG_DEPTH_NEAR}, {LOG_DEPTH_FAR}] m, got {self.fixed_depth}")
+
+
+VEST_PAPER: Final = ModelConfig("vest-paper")
+
+VEST_S: Final = ModelConfig(
+    "vest-s",
+    encoder=EncoderConfig(widths=(24, 48, 96), blocks=(2, 2, 2), decoder=(48, 32), features=16),
+    ego_motion=EgoMotionConfig(widths=(32, 32, 64, 64)),
+    object_motion=ObjectMotionConfig("dmvfn", widths=(64, 64, 64, 32, 32, 32, 16, 16, 16), detail=8),
+    refine=RefineConfig(stem=16, stem_kernel=3, widths=(32, 64, 96, 128)),
+)
+
+#: The whole models, by name.
+CONFIGS: Final[Mapping[str, ModelConfig]] = MappingProxyType({c.name: c for c in (VEST_PAPER, VEST_S)})
+
+
+def _change_object_motion(config: ModelConfig, **fields: object) -> ModelConfig:
+    if config.object_motion is None:
+        raise ValueError(f"{config.name!r} has no object motion to change")
+    changed = dataclasses.replace(config.object_motion, **fields)  # type: ignore[arg-type]
+    return dataclasses.replace(config, object_motion=changed)
+
+
+#: What may follow a model's name after "+": the change that it makes.
+VARIANTS: Final[Mapping[str, Callable[[ModelConfig], ModelConfig]]] = MappingProxyType(
+    {
+        "fixed-depth": lambda c: dataclasses.replace(c, fixed_depth=FIXED_DEPTH),
+        "no-emf": lambda c: dataclasses.replace(c, ego_motion=None),
+        "no-omf": lambda c: dataclasses.replace(c, object_motion=None),
+        "features-only": lambda c: dataclasses.replace(c, render=dataclasses.replace(c.render, colour=False)),
+        "joint": lambda c: dataclasses.replace(c, render=dataclasses.replace(c.render, joint=True)),
+        "residual": lambda c: dataclasses.replace(c, refine=dataclasses.replace(c.refine, residual=True)),
+        "omf-paper": lambda c: _change_object_motion(c, shape="paper"),
+        "omf-dmvfn": lambda c: _change_object_motion(c, shape="dmvfn"),
+        "routing": lambda c: _change_object_motion(c, routing=RoutingConfig()),
+    }
+)
+
+
+def configuration(name: str) -> ModelConfig:
+    """A model by name, with any variants: "vest-paper", "vest-s+no-emf", "vest-s+joint+residual".
+
+    Args:
+        name: a key of `CONFIGS`, then "+" and a key of `VARIANTS` as often as wanted.
+
+    Returns:
+        The configuration; its name is ``name``.
+
+    Raises:
+        ValueError: a part of the name is unknown, or variants that exclude each other.
+    """
+    base, *variants = name.split("+")
+    if base not in CONFIGS:
+        raise ValueError(f"`name` must begin with one of {', '.join(CONFIGS)}, got {base!r}")
+    config = CONFIGS[base]
+    for variant in variants:
+        if variant not in VARIANTS:
+            raise ValueError(f"`name` may add {', '.join(f'+{v}' for v in VARIANTS)}, got {f'+{variant}'!r}")
+        config = VARIANTS[variant](config)
+    return dataclasses.replace(config, name=name)

@@ -1,0 +1,168 @@
+"""Ego-motion forecasting (EMF): how the camera will have moved by the next frame, from two backgrounds."""
+
+from typing import Final, NamedTuple
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from vestcl.models._layers import frame_pair
+from vestcl.models.config import EgoMotionConfig
+
+#: (stride, dilation) of the four convolutions: the one reading of the paper's table that agrees with its sizes.
+CONVOLUTIONS: Final = ((2, 1), (1, 2), (2, 1), (1, 1))
+
+#: A token is background where at least this share of its area is, in either frame.
+BACKGROUND_SHARE: Final = 0.5
+
+#: Wavelengths of the positions go from 2 pi to this many tokens times 2 pi (Vaswani et al. 2017).
+LONGEST_WAVE: Final = 10_000.0
+
+#: No motion: the quaternion (1, 0, 0, 0) and the translation 0.
+_REST: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class RigidMotion(NamedTuple):
+    """``dst_from_src``: x_dst = R(q / |q|) x_src + t."""
+
+    quaternion: torch.Tensor
+    """[B, 4], (w, x, y, z), of any length."""
+    translation: torch.Tensor
+    """[B, 3] m."""
+
+
+class EgoMotion(nn.Module):
+    """Two backgrounds -> the camera's motion from each of them to the next frame.
+
+    Four 3x3 convs with ReLU, shared over the frames, on [F_bg, log D_bg, M]; both frames' channels side by side make
+    the tokens. Sinusoidal positions are added, self-attention blocks follow, and the mean of the tokens, normalised,
+    goes through a linear layer whose weight starts at 0 and whose bias is rest. Foreground is neither looked at by
+    other tokens nor part of the mean, unless there is nothing else.
+
+    Source: SPEC section 4; the paper's section on ego-motion forecasting.
+    """
+
+    def __init__(self, config: EgoMotionConfig | None = None, features: int = 32) -> None:
+        super().__init__()
+        config = config or EgoMotionConfig()
+        self.features = features
+        layers: list[nn.Module] = []
+        channels = features + 2
+        for width, (stride, dilation) in zip(config.widths, CONVOLUTIONS, strict=True):
+            convolution = nn.Conv2d(channels, width, 3, stride=stride, padding=dilation, dilation=dilation)
+            layers += [convolution, nn.ReLU()]
+            channels = width
+        self.frame = nn.Sequential(*layers)
+        tokens = 2 * channels
+        self.blocks = nn.ModuleList(
+            AttentionBlock(tokens, config.heads, config.mlp_ratio) for _ in range(config.blocks)
+        )
+        self.norm = nn.LayerNorm(tokens)
+        self.motion = nn.Linear(tokens, 2 * len(_REST))
+        with torch.no_grad():
+            self.motion.weight.zero_()
+            self.motion.bias.copy_(torch.tensor(_REST).repeat(2))
+
+    def forward(
+        self,
+        features_prev: torch.Tensor,
+        features_cur: torch.Tensor,
+        depth_prev: torch.Tensor,
+        depth_cur: torch.Tensor,
+        mask_prev: torch.Tensor,
+        mask_cur: torch.Tensor,
+    ) -> tuple[RigidMotion, RigidMotion]:
+        """Forecast the camera's motion. All arguments are on the encoder's grid, h x w, of any size.
+
+        Args:
+            features_prev: [B, features, h, w] of the inpainted background at t - 1.
+            features_cur: the same at t.
+            depth_prev: [B, 1, h, w] m of that background.
+            depth_cur: the same at t.
+            mask_prev: [B, 1, h, w], 1 where the frame itself shows static background.
+            mask_cur: the same at t.
+
+        Returns:
+            ``next_from_prev`` and ``next_from_cur``; differentiable in all but the masks' choice of tokens.
+
+        Raises:
+            ValueError: an argument of another shape.
+        """
+        pair = frame_pair(features_prev, features_cur, depth_prev, depth_cur, mask_prev, mask_cur, self.features)
+        grid = torch.cat([self.frame(frame) for frame in pair], dim=1)
+        tokens = (grid + sinusoidal_positions(grid)).flatten(2).mT
+        looked_at = background_tokens(mask_prev, mask_cur, *grid.shape[-2:])
+        for block in self.blocks:
+            tokens = block(tokens, looked_at)
+        weights = looked_at.to(tokens.dtype) / looked_at.sum(dim=1, keepdim=True)
+        mean = (weights[:, None] @ self.norm(tokens))[:, 0]
+        first, second = self.motion(mean).chunk(2, dim=1)
+        return RigidMotion(first[:, :4], first[:, 4:]), RigidMotion(second[:, :4], second[:, 4:])
+
+
+class AttentionBlock(nn.Module):
+    """x + attention(norm(x)), then x + MLP(norm(x)) with GELU: the transformer's pre-LN block."""
+
+    def __init__(self, channels: int, heads: int, mlp_ratio: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm1 = nn.LayerNorm(channels)
+        self.query_key_value = nn.Linear(channels, 3 * channels)
+        self.project = nn.Linear(channels, channels)
+        self.norm2 = nn.LayerNorm(channels)
+        self.mlp = nn.Sequential(
+            nn.Linear(channels, mlp_ratio * channels), nn.GELU(), nn.Linear(mlp_ratio * channels, channels)
+        )
+
+    def forward(self, tokens: torch.Tensor, looked_at: torch.Tensor) -> torch.Tensor:
+        """Mix the tokens.
+
+        Args:
+            tokens: [B, N, channels].
+            looked_at: [B, N] bool; False hides a token from all others, one a sample at least must be True.
+
+        Returns:
+            [B, N, channels]; differentiable in ``tokens``.
+        """
+        split = self.query_key_value(self.norm1(tokens)).unflatten(-1, (3, self.heads, -1))
+        query, key, value = split.permute(2, 0, 3, 1, 4)
+        mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=looked_at[:, None, None])
+        tokens = tokens + self.project(mixed.transpose(1, 2).flatten(2))
+        return tokens + self.mlp(self.norm2(tokens))
+
+
+def background_tokens(mask_prev: torch.Tensor, mask_cur: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """Which tokens are background in both frames; all of them where none is.
+
+    Args:
+        mask_prev: [B, 1, h, w], 1 on the background.
+        mask_cur: [B, 1, h, w].
+        height: rows of tokens.
+        width: columns of tokens.
+
+    Returns:
+        [B, height width] bool.
+    """
+    shares = (functional.adaptive_avg_pool2d(mask, (height, width)) for mask in (mask_prev, mask_cur))
+    background = torch.stack([share >= BACKGROUND_SHARE for share in shares]).all(dim=0).flatten(1)
+    return background | ~background.any(dim=1, keepdim=True)
+
+
+def sinusoidal_positions(grid: torch.Tensor) -> torch.Tensor:
+    """Position p in channels 2k, 2k + 1 of n: sin and cos of p / LONGEST_WAVE^(2k / n); first rows, then columns.
+
+    Args:
+        grid: [B, C, h, w], C a multiple of 4; only size, dtype and device count.
+
+    Returns:
+        [C, h, w].
+    """
+    channels, height, width = grid.shape[1:]
+    half = channels // 2
+    exponents = torch.arange(0, half, 2, dtype=grid.dtype, device=grid.device) / half
+    waves = []
+    for size in (height, width):
+        angle = torch.arange(size, dtype=grid.dtype, device=grid.device) / LONGEST_WAVE ** exponents[:, None]
+        waves.append(torch.stack([angle.sin(), angle.cos()], dim=1).flatten(0, 1))
+    rows, columns = waves
+    return torch.cat([rows[:, :, None].expand(-1, -1, width), columns[:, None].expand(-1, height, -1)])
