@@ -153,7 +153,7 @@ def test_a_build_error_points_to_file_and_line(kernels: Path, fresh: runtime.Ses
 def test_float64_on_a_device_without_it(kernels: Path, fresh: runtime.Session) -> None:
     fresh.info = dataclasses.replace(fresh.info, float64=False)
     assert scale(fresh, 2, np.ones(3, np.float32)).tolist() == [2, 2, 2]
-    with pytest.raises(runtime.DeviceError, match="has no float64; pass float32"):
+    with pytest.raises(runtime.DeviceError, match="has no float64: pass float32"):
         scale(fresh, 2, np.ones(3))
 
 
