@@ -56,8 +56,8 @@ static int4 image_rect(global const view_t* view, global const solid_t* s, int h
   return (int4)(first, last);
 }
 
-// The cells of the road grid that the solid's shadow or its daylight shade can touch.
-static int4 shadow_rect(global const view_t* view, global const solid_t* s, int rows, int columns)
+// The rectangle [x, z, x, z] of road where the solid's shadow or its daylight shade can fall, metres from the camera.
+static float4 shadow_rect(global const view_t* view, global const solid_t* s)
 {
   const float3 sun = load3(view->sun);
   float2 low = INFINITY, high = -INFINITY;
@@ -67,10 +67,16 @@ static int4 shadow_rect(global const view_t* view, global const solid_t* s, int 
     low = min(low, fallen);
     high = max(high, fallen);
   }
-  const float2 origin = (float2)(view->grid[0], view->grid[1]), size = (float2)(columns, rows);
   const float margin = s->material == MATERIAL_CAR_BODY ? 0.8f : 0.05f;
-  const int2 first = convert_int2(clamp(floor((low - margin - origin) / SHADOW_CELL), (float2)(0), size));
-  const int2 last = convert_int2(clamp(ceil((high + margin - origin) / SHADOW_CELL), (float2)(0), size));
+  return (float4)(low - margin, high + margin);
+}
+
+// The cells of the shadow grid that it touches; a pavement's own shadow is too low to count.
+static int4 cells_of(global const view_t* view, global const solid_t* s, float4 rect, int rows, int columns)
+{
+  const float2 origin = (float2)(view->grid[0], view->grid[1]), size = (float2)(columns, rows);
+  const int2 first = convert_int2(clamp(floor((rect.lo - origin) / SHADOW_CELL), (float2)(0), size));
+  const int2 last = convert_int2(clamp(ceil((rect.hi - origin) / SHADOW_CELL), (float2)(0), size));
   return s->material == MATERIAL_PAVEMENT ? (int4)(0) : (int4)(first, last);
 }
 
@@ -79,11 +85,13 @@ kernel void project_solids(
     global const view_t* restrict view,      // [1]
     global const solid_t* restrict solids,   // [P]
     global int4* restrict image_rects,       // [P] out, pixels
-    global int4* restrict shadow_rects)      // [P] out, cells
+    global int4* restrict shadow_cells,      // [P] out
+    global float4* restrict shadow_rects)    // [P] out, metres
 {
   const int i = get_global_id(0);
   image_rects[i] = image_rect(view, solids + i, height, width);
-  shadow_rects[i] = shadow_rect(view, solids + i, cell_rows, cell_columns);
+  shadow_rects[i] = shadow_rect(view, solids + i);
+  shadow_cells[i] = cells_of(view, solids + i, shadow_rects[i], cell_rows, cell_columns);
 }
 
 kernel void list_solids(
@@ -236,6 +244,7 @@ kernel void raycast(
     global const int4* restrict image_rects,     // [P]
     global const ushort* restrict tile_solids,   // [tiles, P]
     global const int* restrict tile_counts,      // [tiles]
+    global const float4* restrict shadow_rects,  // [P]
     global const ushort* restrict cell_solids,   // [cells, P]
     global const int* restrict cell_counts,      // [cells]
     global const float2* restrict crossings,     // [crossings]
@@ -246,8 +255,8 @@ kernel void raycast(
   const int tile = get_global_id(0);
   const int y = tile / tile_columns * TILE + get_global_id(1), x0 = tile % tile_columns * TILE;
   if (y >= height) return;
-  const scene_t scene = {view, solids, cell_solids, cell_counts, crossings, solid_count, crossing_count, cell_rows,
-                         cell_columns};
+  const scene_t scene = {view, solids, shadow_rects, cell_solids, cell_counts, crossings, solid_count, crossing_count,
+                         cell_rows, cell_columns};
   const float3 left = multiply(view->ray, (float3)(x0 + 0.5f, y + 0.5f, 1));
   const float16 step = (float16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
   const float16 dx = left.x + step * view->ray[0], dy = left.y + step * view->ray[3], dz = left.z + step * view->ray[6];

@@ -1,15 +1,15 @@
 // Sky, sun, shadows and what reaches the eye.
 
 #define SUNLIGHT ((float3)(3.1f, 2.75f, 2.25f))
-#define HORIZON ((float3)(0.66f, 0.76f, 0.88f))
-#define ZENITH ((float3)(0.10f, 0.25f, 0.62f))
+#define HORIZON ((float3)(0.62f, 0.74f, 0.90f))
+#define ZENITH ((float3)(0.055f, 0.20f, 0.60f))
 #define HAZE_REACH 210.0f  // metres; the square in haze() hides what the generator no longer builds
 
 static float3 clear_sky(float3 ray, float3 sun)
 {
   const float up = max(-ray.y, 0.0f), towards = max(dot(ray, sun), 0.0f);
   const float glow = towards * towards * towards * towards;
-  return mix(HORIZON, ZENITH, 1 - 1 / (1 + 3.2f * up)) + 0.22f * glow * (float3)(1.0f, 0.9f, 0.7f);
+  return mix(HORIZON, ZENITH, 1 - 1 / (1 + 4.5f * up)) + 0.22f * glow * (float3)(1.0f, 0.9f, 0.7f);
 }
 
 static float cloud(float2 at, uint seed)
@@ -40,15 +40,17 @@ static float2 light_at(const scene_t* scene, float3 point, int own, bool ground)
 {
   const float3 sun = load3(scene->view->sun);
   const float fall = (-scene->view->camera[1] - point.y) / sun.y;
-  const int column = (int)floor((point.x + sun.x * fall - scene->view->grid[0]) / SHADOW_CELL);
-  const int row = (int)floor((point.z + sun.z * fall - scene->view->grid[1]) / SHADOW_CELL);
+  const float2 fallen = point.xz + sun.xz * fall;
+  const int column = (int)floor((fallen.x - scene->view->grid[0]) / SHADOW_CELL);
+  const int row = (int)floor((fallen.y - scene->view->grid[1]) / SHADOW_CELL);
   if (column < 0 || row < 0 || column >= scene->cell_columns || row >= scene->cell_rows) return (float2)(1, 1);
   const int cell = row * scene->cell_columns + column;
   float2 light = 1;
   for (int k = 0; k < scene->cell_counts[cell]; k++) {
     const int i = scene->cell_solids[(size_t)cell * scene->solid_count + k];
+    const float4 rect = scene->shadow_rects[i];
+    if (i == own || fallen.x < rect.x || fallen.y < rect.y || fallen.x > rect.z || fallen.y > rect.w) continue;
     global const solid_t* solid = scene->solids + i;
-    if (i == own) continue;
     if (ground && solid->material == MATERIAL_CAR_BODY) {
       const float3 at = fabs(to_local(solid, point - load3(solid->centre))) - load3(solid->half_size);
       light.y *= 0.3f + 0.7f * smoothstep(-0.35f, 0.45f, length(max(at.xz, (float2)(-0.2f)) + 0.2f) - 0.2f);
@@ -84,7 +86,8 @@ static float3 shade(surface_t surface, float3 normal, float3 ray, float3 sun, fl
     const float graze = 1 - clamp(-dot(ray, normal), 0.0f, 1.0f), glance = max(dot(away, sun), 0.0f);
     const float power = glance * glance * glance * glance * glance * glance;
     const float share = surface.mirror + min(0.5f, 3 * surface.mirror) * graze * graze * graze;
-    colour = mix(colour, reflected(away, sun), min(share, 0.8f)) + light.x * surface.mirror * 9 * power * power * power;
+    const float glint = 9 * min(surface.mirror, 0.1f) * power * power * power * power;
+    colour = mix(colour, reflected(away, sun), min(share, 0.8f)) + light.x * glint;
   }
   return colour;
 }

@@ -121,8 +121,13 @@ static surface_t window(surface_t wall, float x, float y, float reach, float top
   const float lintel = centred(x, reach + 0.1f, footprint.x) * band(y, top, top + 0.17f, footprint.y);
   const float shade = band(y, -0.5f, -0.13f, footprint.y) * centred(x, reach + 0.05f, footprint.x);
   const float kind = random(1, 2, key), drop = top * (0.25f + 0.6f * random(3, 4, key));
-  const float3 room = kind < 0.12f ? (float3)(0.30f, 0.21f, 0.10f) : (float3)(0.022f, 0.028f, 0.036f) * (0.6f + kind);
-  const float curtain = kind > 0.55f ? band(y, top - drop, top, footprint.y) : 0;
+  const bool shop = top > 2;
+  const float heap = shop ? noise2((float2)(3.1f * x, 2.3f * y), key) : 0;
+  const float goods = smoothstep(0.45f, 0.75f, heap) * band(y, 0, 1.6f, 0.5f);
+  const float3 ware = (float3)(random(5, 6, key), random(7, 8, key), random(9, 10, key)) * 0.3f + 0.05f;
+  const float3 lit = kind < 0.12f ? (float3)(0.30f, 0.21f, 0.10f) : (float3)(0.022f, 0.028f, 0.036f) * (0.6f + kind);
+  const float3 room = mix(shop ? (float3)(0.05f, 0.045f, 0.04f) : lit, ware, goods);
+  const float curtain = kind > 0.55f && !shop ? band(y, top - drop, top, footprint.y) : 0;
   const float recess = max(band(y, top - 0.2f, top, footprint.y), band(x, -reach, -reach + 0.13f, footprint.x));
   float3 pane = mix(room, (float3)(0.42f, 0.41f, 0.37f) * (0.5f + 0.4f * kind), curtain);
   pane = mix(pane * (1 - 0.6f * recess), (float3)(0.55f, 0.54f, 0.5f), bars);

@@ -36,6 +36,7 @@ typedef struct {
 typedef struct {
   global const view_t* view;
   global const solid_t* solids;        // [P]
+  global const float4* shadow_rects;   // [P] x and z where a shadow falls on the road, metres
   global const ushort* cell_solids;    // [rows * columns, P]
   global const int* cell_counts;       // [rows * columns]
   global const float2* crossings;      // [crossings] z where a side street begins and ends
