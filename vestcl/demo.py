@@ -94,9 +94,8 @@ def run(out: Path, height: int, width: int, seed: int) -> None:
     _print_times(console, stages)
     covered = (coverage > 0).expand_as(shown)
     psnr = -10 * math.log10(float(((shown - torch.from_numpy(truth.colour))[covered] ** 2).mean()))
-    console.print(
-        f"PSNR against the truth: {psnr:.1f} dB where the source saw the street, {covered.float().mean():.1%}"
-    )
+    seen = float(covered.float().mean())
+    console.print(f"PSNR against the truth: {psnr:.1f} dB over the {seen:.1%} of the view that the source saw")
     for path in paths:
         console.print(str(path), soft_wrap=True, highlight=False)
 

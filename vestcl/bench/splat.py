@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -29,6 +30,9 @@ SIZES: Final = ((64, 208), (128, 416), (256, 832), (512, 1664), (1024, 3328))
 
 #: (height, width, radius) -> copies that forward, and forward + backward, may take.
 TARGETS: Final = {(256, 832, 1.0): (6.0, 8.0), (256, 832, 2.0): (10.0, 16.0)}
+
+#: Columns of the tables where they don't go to a terminal, whose own number counts there.
+WIDTH: Final = 140
 
 _PACKAGES: Final = ("torch", "numpy", "pyopencl", "pocl-binary-distribution")
 
@@ -71,7 +75,7 @@ def main(config: SplatBench) -> None:
         DeviceError: no such device.
     """
     _check(config)
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
     with runtime.use(config.device) as session, _timing.torch_threads(config.threads):
         machine = describe(session)
         for name, value in machine.items():
