@@ -141,6 +141,9 @@ _selected: contextvars.ContextVar["Session | None"] = contextvars.ContextVar("ve
 class use:  # noqa: N801 - reads as a verb, like contextlib.suppress
     """Run vestcl's operators on another device: from here on, or inside a ``with`` block.
 
+    It holds for the thread that calls it; other threads start with the default device (set VESTCL_DEVICE for all).
+    Gradients are computed on the device that their forward ran on.
+
     Args:
         selector: as in `select`.
         mapping: how work is laid out, "tile" (a work-item a tile, for CPUs) or "pixel" (a work-item a pixel, tile
