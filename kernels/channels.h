@@ -2,16 +2,12 @@
 // vector overlaps the one before by OVERLAP lanes, so that every access stays inside the row and is a whole vector.
 //   CHANNELS   numbers a row
 //   VECTOR     1, 4, 8 or 16 lanes, at most CHANNELS
-//   BUILTINS   1: the compiler has clang's builtins for prefetching and streaming
 //   STREAM     1: rows are whole, aligned cache lines and VECTOR divides them; write them past the cache
 #ifndef CHANNELS
 #error "define CHANNELS, the number of features of a point"
 #endif
 #ifndef VECTOR
 #error "define VECTOR, the lanes of a vector of channels"
-#endif
-#ifndef BUILTINS
-#error "define BUILTINS as 0 or 1"
 #endif
 #ifndef STREAM
 #error "define STREAM as 0 or 1"
@@ -110,10 +106,3 @@ inline void clear_row(global REAL* row) {
   for (int k = 0; k < BLOCKS; k++) zeros[k] = 0;
   stream_row(zeros, row);
 }
-
-#if BUILTINS
-#define PREFETCH(pointer) __builtin_prefetch((const void*)(uintptr_t)(pointer), 0, 3)
-#else
-#define PREFETCH(pointer)
-#endif
-#define CACHE_LINE 64

@@ -10,6 +10,7 @@
 //   TOGETHER   defined: sort_tiles_together, a work-group a tile (for GPUs), instead of sort_tiles, a work-item a tile
 #include "common.h"
 #include "splat.h"
+#include "prefetch.h"
 
 // Points whose tiles are found at a time, in a loop that compilers turn into vector code.
 #define STRIP 128
@@ -196,6 +197,12 @@ kernel void sort_tiles(
   const int t = get_global_id(0);
   const int begin = tile_starts[t], n = tile_starts[t + 1] - begin;
   const int tiles = tiles_x * tiles_y, top = t % tiles / tiles_x * TILE, left = t % tiles_x * TILE;
+  for (int i = begin; i < begin + n; i++) {  // in the order of the index, close together; after the sort they are not
+    const size_t id = entries[i].id;
+    PREFETCH(points_uv + 2 * id);
+    PREFETCH(radii + id);
+    PREFETCH(opacities + id);
+  }
   sort_list(entries + begin, room + begin, n);
   long slots = 0;
   for (int i = begin; i < begin + n; i++) {

@@ -15,6 +15,7 @@
 //
 #include "common.h"
 #include "splat.h"
+#include "prefetch.h"
 #include "channels.h"
 #include "splat_gradients.h"
 #include "tile.h"

@@ -83,7 +83,7 @@ def chunks_of(session: runtime.Session, points: int, counters: int) -> int:
 
 def list_tiles(session: runtime.Session, geometry: Geometry) -> TileLists:
     """Count each chunk's points per tile, list them by tile in order of their index, sort each list by depth."""
-    defines = runtime.defines_for(geometry.z.dtype)
+    defines = _defines(session, geometry)
     tile_counts = np.zeros(geometry.batch * geometry.tiles, np.int32)
     with session.job() as job:
         places = job.scratch(geometry.points, np.int32)
@@ -112,6 +112,10 @@ def list_tiles(session: runtime.Session, geometry: Geometry) -> TileLists:
             [*geometry.sizes, starts, points_uv, z, radii, places, job.read(tile_starts), counts, entries],
         )  # fmt: skip
         return _sort(job, geometry, tile_starts, int(spans.max()), places, entries)
+
+
+def _defines(session: runtime.Session, geometry: Geometry) -> dict[str, str | int]:
+    return runtime.defines_for(geometry.z.dtype, BUILTINS=int(session.compiles_builtins))
 
 
 def _starts(tile_counts: Array) -> Array:
@@ -145,7 +149,7 @@ def _sort(
         room = job.scratch(count, _entry_type(geometry))
         arguments: list[runtime.Argument] = [*geometry.sizes, *map(job.read, arrays)]
         arguments += [entries, room, records, job.write(tile_slots)]
-        defines = runtime.defines_for(geometry.z.dtype)
+        defines = _defines(job.session, geometry)
         if together:
             group = constants.TILE**2
             job.launch(
