@@ -1,0 +1,45 @@
+"""What any forecast gives, whoever makes it: images of future frames from the cameras that were asked for."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera beside the forecast one."""
+
+    name: str
+    tgt_from_next: NDArray[np.float64]
+    """[4, 4] m: from the source camera as it stands at the forecast time."""
+    K: NDArray[np.float64] | None = None
+    """[3, 3] px; None is the source camera's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """One future frame from one view."""
+
+    image: NDArray[np.float32]
+    """[3, H, W] RGB in [0, 1], holes filled."""
+    depth: NDArray[np.float32]
+    """[1, H, W] m; 0 where unknown."""
+    coverage: NDArray[np.float32]
+    """[1, H, W] in [0, 1], before holes were filled."""
+    motion_xyz: NDArray[np.float32]
+    """[3, H, W] m: by how much what the pixel shows moved over the last frame interval, x_(t+k) - x_(t+k-1), each in
+    its own time's source camera; 0 where unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """The frames at t+1, t+2, ... from every view."""
+
+    method: str
+    future_from_cur: list[NDArray[np.float64]]
+    """Per step k, [4, 4] m: from the camera at t to the camera at t+k."""
+    frames: list[dict[str, Rendered]]
+    """Per step, by the view's name."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time by stage."""
