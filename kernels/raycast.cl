@@ -15,8 +15,8 @@
 #include "raycast_town.h"
 #include "raycast_things.h"
 #include "raycast_light.h"
-
-#define EDGE 0.09f  // how far from a car's edges its normal bends, metres
+#include "raycast_normals.h"
+#include "raycast_trace.h"
 
 #if TILE != LANES
 #error "a row of a tile must be LANES pixels"
@@ -111,90 +111,6 @@ kernel void list_solids(
   }
 }
 
-// Where the leaves are in front of what was hit so far: the shell's near side, else its far side seen through a gap.
-static void hit_foliage(
-    global const solid_t* solid, int id, const float* dx, const float* dy, const float* dz, float16 enter, float16 exit,
-    float* best, int* hit)
-{
-  float near[LANES], far[LANES];
-  vstore16(enter, 0, near);
-  vstore16(exit, 0, far);
-  for (int lane = 0; lane < LANES; lane++) {
-    if (!(near[lane] < far[lane] && near[lane] > (float)NEAR && near[lane] < best[lane])) continue;
-    const float3 ray = (float3)(dx[lane], dy[lane], dz[lane]), from = -load3(solid->centre);
-    float s = near[lane];
-    if (is_gap(solid, to_local(solid, from + s * ray))) {
-      s = far[lane];
-      if (s >= best[lane] || is_gap(solid, to_local(solid, from + s * ray))) continue;
-    }
-    best[lane] = s;
-    hit[lane] = id;
-  }
-}
-
-// The face of a box that a point of its surface is on, and how far outside each face's plane it is (zero or negative).
-static int face_of(global const solid_t* s, float3 unit, float* out)
-{
-  const float rise = 0.5f * (1 - unit.y);
-  out[FACE_RIGHT] = unit.x - 1 + rise * s->taper[0];
-  out[FACE_LEFT] = -unit.x - 1 + rise * s->taper[0];
-  out[FACE_FRONT] = unit.z - 1 + rise * s->taper[1];
-  out[FACE_BACK] = -unit.z - 1 + rise * s->taper[2];
-  out[FACE_TOP] = -unit.y - 1;
-  out[FACE_BOTTOM] = unit.y - 1;
-  int face = 0;
-  for (int i = 1; i < 6; i++)
-    if (out[i] > out[face]) face = i;
-  return face;
-}
-
-// Outward unit normal in the solid's own axes.
-static float3 face_normal(global const solid_t* s, int face)
-{
-  const float side = -0.5f * s->taper[0], front = -0.5f * s->taper[1], back = -0.5f * s->taper[2];
-  const float3 scale = 1 / load3(s->half_size);
-  switch (face) {
-    case FACE_RIGHT: return normalize(scale * (float3)(1, side, 0));
-    case FACE_LEFT: return normalize(scale * (float3)(-1, side, 0));
-    case FACE_FRONT: return normalize(scale * (float3)(0, front, 1));
-    case FACE_BACK: return normalize(scale * (float3)(0, back, -1));
-    case FACE_TOP: return (float3)(0, -1, 0);
-    default: return (float3)(0, 1, 0);
-  }
-}
-
-// A car's edges look round: near them its normal turns from face to face.
-static float3 bent_normal(global const solid_t* s, const float* out)
-{
-  const float3 reach = load3(s->half_size);
-  const float size[6] = {reach.x, reach.x, reach.z, reach.z, reach.y, reach.y};
-  float3 sum = 0;
-  for (int i = 0; i < 6; i++) {
-    const float weight = 1 + out[i] * size[i] / EDGE;
-    if (weight > 0) sum += weight * weight * face_normal(s, i);
-  }
-  return normalize(sum);
-}
-
-static bool is_car(int material)
-{
-  return material == MATERIAL_CAR_BODY || material == MATERIAL_CAR_PANEL || material == MATERIAL_CAR_CABIN;
-}
-
-// Face and normal of the solid at the point of its surface that hit->own holds.
-static void orient(global const solid_t* s, hit_t* hit)
-{
-  const float3 reach = load3(s->half_size), unit = hit->own / reach;
-  float3 normal = unit / reach;
-  if (s->shape == SHAPE_CYLINDER) normal = fabs(unit.y) > 0.999f ? (float3)(0, unit.y, 0) : (float3)(unit.x, 0, unit.z);
-  if (s->shape == SHAPE_BOX) {
-    float out[6];
-    hit->face = face_of(s, unit, out);
-    normal = is_car(s->material) ? bent_normal(s, out) : face_normal(s, hit->face);
-  }
-  hit->normal = normalize(to_world(s, normal));
-}
-
 static surface_t surface_of(const scene_t* scene, global const solid_t* solid, const hit_t* hit)
 {
   switch (solid->material) {
@@ -214,9 +130,7 @@ static surface_t surface_of(const scene_t* scene, global const solid_t* solid, c
   }
 }
 
-// The colour of what the ray hits at z-depth s: solid `id`, the road (ROAD) or nothing (SKY).
-enum { SKY = -2, ROAD = -1 };
-
+// Linear light from what the ray hits at z-depth s: solid `id`, ROAD or SKY.
 static float3 colour_of(const scene_t* scene, float3 ray, float s, int id)
 {
   global const view_t* view = scene->view;
@@ -236,9 +150,13 @@ static float3 colour_of(const scene_t* scene, float3 ray, float s, int id)
   return haze(shade(surface, hit.normal, unit_ray, sun, light), s);
 }
 
+// Depth, label and instance are of the ray through a pixel's centre. Colour is the mean over samples x samples rays a
+// pixel in linear light, as a sensor sums it, and only then goes through the film curve: display() of a mean.
 kernel void raycast(
     const int height, const int width, const int tile_columns, const int solid_count, const int crossing_count,
     const int cell_rows, const int cell_columns,
+    const int samples,                           // 0 leaves colour as it is
+    const int with_instances,                    // 0 leaves instances as they are
     global const view_t* restrict view,          // [1]
     global const solid_t* restrict solids,       // [P]
     global const int4* restrict image_rects,     // [P]
@@ -250,47 +168,38 @@ kernel void raycast(
     global const float2* restrict crossings,     // [crossings]
     global float* restrict colour,               // [3, H, W] out
     global float* restrict depth,                // [1, H, W] out
-    global uchar* restrict labels)               // [1, H, W] out
+    global uchar* restrict labels,               // [1, H, W] out
+    global int* restrict instances)              // [1, H, W] out
 {
   const int tile = get_global_id(0);
   const int y = tile / tile_columns * TILE + get_global_id(1), x0 = tile % tile_columns * TILE;
   if (y >= height) return;
   const scene_t scene = {view, solids, shadow_rects, cell_solids, cell_counts, crossings, solid_count, crossing_count,
                          cell_rows, cell_columns};
-  const float3 left = multiply(view->ray, (float3)(x0 + 0.5f, y + 0.5f, 1));
-  const float16 step = (float16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-  const float16 dx = left.x + step * view->ray[0], dy = left.y + step * view->ray[3], dz = left.z + step * view->ray[6];
-  float rays_x[LANES], rays_y[LANES], rays_z[LANES], best[LANES];
-  int hit[LANES];
-  vstore16(dx, 0, rays_x);
-  vstore16(dy, 0, rays_y);
-  vstore16(dz, 0, rays_z);
-  const float16 road = -view->camera[1] / dy;
-  const int16 on_road = road > (float)NEAR && road < (float)SKY_DEPTH;
-  vstore16(select((float16)(SKY_DEPTH), road, on_road), 0, best);
-  vstore16(select((int16)(SKY), (int16)(ROAD), on_road), 0, hit);
-  for (int k = 0; k < tile_counts[tile]; k++) {
-    const int i = tile_solids[(size_t)tile * solid_count + k];
-    if (y < image_rects[i].y || y >= image_rects[i].w) continue;
-    float16 enter, exit;
-    interval_float16(solids + i, (float3)(0), dx, dy, dz, &enter, &exit);
-    if (solids[i].material == MATERIAL_FOLIAGE) {
-      hit_foliage(solids + i, i, rays_x, rays_y, rays_z, enter, exit, best, hit);
-    } else {
-      const float16 nearest = vload16(0, best);
-      const int16 nearer = enter < exit && enter > (float)NEAR && enter < nearest;
-      vstore16(select(nearest, enter, nearer), 0, best);
-      vstore16(select(vload16(0, hit), (int16)(i), nearer), 0, hit);
+  global const ushort* listed = tile_solids + (size_t)tile * solid_count;
+  const int lanes = min(LANES, width - x0), rays = samples * samples;
+  const size_t plane = (size_t)height * width, at = (size_t)y * width + x0;
+  row_t row;
+  float3 light[LANES];
+  for (int lane = 0; lane < LANES; lane++) light[lane] = 0;
+  for (int pass = samples > 1 ? -1 : 0; pass < max(rays, 1); pass++) {  // of several rays, first the centre's
+    const bool centre = samples < 2 || pass < 0;
+    const float2 inside = centre ? (float2)(0.5f) : (float2)(pass % samples + 0.5f, pass / samples + 0.5f) / samples;
+    const float3 left = multiply(view->ray, (float3)(x0 + inside.x, y + inside.y, 1));
+    trace(&scene, listed, tile_counts[tile], image_rects, y, left, &row);
+    for (int lane = 0; lane < lanes && centre; lane++) {
+      const int id = row.hit[lane];
+      depth[at + lane] = row.best[lane];
+      labels[at + lane] = id == SKY ? LABEL_SKY : id == ROAD ? LABEL_ROAD : solids[id].label;
+      if (with_instances) instances[at + lane] = id < 0 ? 0 : solids[id].instance;
     }
+    for (int lane = 0; lane < lanes && pass >= 0 && rays > 0; lane++)
+      light[lane] += colour_of(&scene, (float3)(row.x[lane], row.y[lane], row.z[lane]), row.best[lane], row.hit[lane]);
   }
-  for (int lane = 0; lane < min(LANES, width - x0); lane++) {
-    const float3 ray = (float3)(rays_x[lane], rays_y[lane], rays_z[lane]);
-    const float3 c = display(colour_of(&scene, ray, best[lane], hit[lane]));
-    const size_t plane = (size_t)height * width, at = (size_t)y * width + x0 + lane;
-    colour[at] = c.x;
-    colour[plane + at] = c.y;
-    colour[2 * plane + at] = c.z;
-    depth[at] = best[lane];
-    labels[at] = hit[lane] == SKY ? LABEL_SKY : hit[lane] == ROAD ? LABEL_ROAD : solids[hit[lane]].label;
+  for (int lane = 0; lane < lanes && rays > 0; lane++) {
+    const float3 c = display(light[lane] / rays);
+    colour[at + lane] = c.x;
+    colour[plane + at + lane] = c.y;
+    colour[2 * plane + at + lane] = c.z;
   }
 }

@@ -19,6 +19,7 @@ typedef struct {
   float tint[3];  // linear RGB
   int shape, material, label;
   uint seed;
+  int instance;   // of what moves; 0 stands still
 } solid_t;
 
 typedef struct {
@@ -26,7 +27,7 @@ typedef struct {
   float project[9];    // K R^T: a point to its homogeneous pixel
   float camera[3];     // where the camera is in the world; the road is y = 0
   float sun[3];        // unit vector towards it
-  float pixel;         // width of a pixel at 1 m, metres
+  float pixel;         // width of what one ray stands for at 1 m, metres
   float lane, kerb;    // centre line to edge line and to kerb, metres
   float grid[2];       // x and z of the shadow grid's corner
   uint seed;

@@ -13,13 +13,13 @@ WHITE = (0.5, 0.5, 0.5)
 NOON = (0.0, -1.0, 0.0)
 
 
-def look(*solids: Solids, sun: tuple[float, float, float] = NOON) -> Frame:
+def look(*solids: Solids, sun: tuple[float, float, float] = NOON, samples: int = 1, instances: bool = False) -> Frame:
     camera_from_world = np.eye(4)
     camera_from_world[1, 3] = EYE
     seen = objects.placed(np.concatenate(solids), 0.0, EYE, 0.0)
     scene = Scene(seen, np.zeros((0, 2), np.float32), sun, lane=3.0, kerb=5.0, seed=0)
-    frame = blank_frame(1, HEIGHT, WIDTH)
-    cast(scene, camera_from_world, K, frame, 0)
+    frame = blank_frame(1, HEIGHT, WIDTH, instances)
+    cast(scene, camera_from_world, K, frame, 0, samples)
     return frame
 
 
@@ -115,6 +115,31 @@ def test_shadow_falls_away_from_the_sun(session: runtime.Session) -> None:
     assert dark.max() < 0.8 * light.min()
 
 
+def test_instances_by_hand(session: runtime.Session) -> None:
+    """Of a box with a number, before one without: 7 on its front, 0 on the other, the road and the sky."""
+    front = plain(Shape.BOX, (0.0, -1.0, 10.0), (1.0, 1.0, 1.0))
+    front["instance"] = 7
+    frame = look(plain(Shape.BOX, (0.0, -1.0, 14.0), (4.0, 1.0, 1.0)), front, instances=True)
+    assert frame.instances is not None
+    assert np.array_equal(
+        frame.instances[0, 0] == 7, frame.depth[0, 0] < np.where(frame.labels[0, 0] == Label.POLE, 10, 0)
+    )
+    assert set(np.unique(frame.instances)) == {0, 7}
+
+
+def test_samples_cover_part_of_a_pixel(session: runtime.Session) -> None:
+    """A far post 1.5 pixels wide: many rays see it in part of its two columns, one ray in all or nothing of them."""
+    post = plain(Shape.BOX, (0.0, -25.0, 20.0), (0.375, 25.0, 0.01))
+    one, many = look(post), look(post, samples=4)
+    row = 6  # above the horizon, where the sky is even
+    columns = slice(WIDTH // 2 - 3, WIDTH // 2 + 3)
+    sky, dark = one.colour[0, 2, row, columns].max(), one.colour[0, 2, row, columns].min()
+    between = (many.colour[0, 2, row, columns] < sky - 0.02) & (many.colour[0, 2, row, columns] > dark + 0.02)
+    assert sky - dark > 0.1
+    assert between.sum() == 2
+    assert not np.any((one.colour[0, 2, row, columns] < sky - 0.02) & (one.colour[0, 2, row, columns] > dark + 0.02))
+
+
 def test_shadows_reach_over_the_whole_grid() -> None:
     assert SHADOW_REACH % SHADOW_CELL == 0
 
@@ -122,6 +147,7 @@ def test_shadows_reach_over_the_whole_grid() -> None:
 def test_same_bits_twice(session: runtime.Session) -> None:
     solids = objects.tree(np.random.default_rng(0)), objects.car(np.random.default_rng(1))
     placed = [objects.placed(part, x, 0.0, 9.0, 0.3) for part, x in zip(solids, (1.5, -1.5), strict=True)]
-    first, second = look(*placed), look(*placed)
-    assert np.array_equal(first.colour, second.colour)
-    assert np.array_equal(first.depth, second.depth)
+    for samples in (1, 2):
+        first, second = look(*placed, samples=samples), look(*placed, samples=samples)
+        assert np.array_equal(first.colour, second.colour)
+        assert np.array_equal(first.depth, second.depth)

@@ -9,7 +9,9 @@ import torch
 import vestcl
 from vestcl import runtime
 from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
+from vestcl.data.raycast import FOREGROUND
 from vestcl.data.street import CAMERA_HEIGHT
+from vestcl.io.labels import background
 
 HEIGHT, WIDTH = 96, 320
 
@@ -51,7 +53,8 @@ def test_seed_decides(session: runtime.Session) -> None:
 
 def test_depth_of_the_road_by_hand(session: runtime.Session) -> None:
     """A level camera sees flat road at z = h f / (v - cy)."""
-    frame, K = look(Street.generate(0)), intrinsics(HEIGHT, WIDTH)
+    level = shift(x=-1.6, y=CAMERA_HEIGHT)
+    frame, K = look(Street.generate(0), camera_from_world=level), intrinsics(HEIGHT, WIDTH)
     rows, columns = np.nonzero(frame.labels[0, 0] == Label.ROAD)
     by_hand = CAMERA_HEIGHT * K[1, 1] / (rows + 0.5 - K[1, 2])
     near = by_hand < 30
@@ -103,13 +106,84 @@ def test_batches_are_single_frames(session: runtime.Session) -> None:
         assert np.array_equal(both.depth[i], alone.depth[0])
 
 
-def test_drives_forward_and_stays_in_its_lane() -> None:
-    street = Street.generate(5)
-    poses = np.stack([street.camera_pose(t) for t in np.arange(0, 20, 0.1)])
-    steps = np.diff(poses[:, 2, 3])
-    assert steps.min() > 0.5
-    assert steps.max() < 1.5
-    assert np.abs(poses[:, 0, 3]).max() < street.lane
+def film_curve(light: np.ndarray) -> np.ndarray:
+    """Linear light to a display's [0, 1], as `display` in kernels/raycast_light.h."""
+    x = 0.7 * np.maximum(light, 0)
+    return np.sqrt(np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1))
+
+
+def light_of(colour: np.ndarray) -> np.ndarray:
+    """Its inverse: of y = colour^2, the positive root of (2.51 - 2.43 y) x^2 + (0.03 - 0.59 y) x - 0.14 y = 0."""
+    y = np.asarray(colour, np.float64) ** 2
+    a, b, c = 2.51 - 2.43 * y, 0.03 - 0.59 * y, -0.14 * y
+    return (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a) / 0.7
+
+
+@pytest.mark.parametrize("samples", [2, 3])
+def test_samples_are_averaged_in_linear_light(session: runtime.Session, samples: int) -> None:
+    """A picture ``samples`` times as large has one pixel for each ray."""
+    street, size = Street.generate(1), (24, 80)
+    small = look(street, K=intrinsics(*size), height=size[0], width=size[1], samples=samples)
+    large = look(
+        street,
+        K=np.diag([samples, samples, 1.0]) @ intrinsics(*size),
+        height=samples * size[0],
+        width=samples * size[1],
+    )
+    rays = light_of(large.colour[0]).reshape(3, size[0], samples, size[1], samples)
+    error = np.abs(film_curve(rays.mean(axis=(2, 4))) - small.colour[0])
+    unclipped = rays.max(axis=(0, 2, 4)) < 5
+    assert unclipped.mean() > 0.9
+    # float32 puts a ray at a leaf's edge on one side or on the other, seldom.
+    assert np.quantile(error[:, unclipped], 0.98) < 1e-3
+    display_mean = large.colour[0].reshape(rays.shape).mean(axis=(2, 4))
+    assert np.abs(display_mean - small.colour[0]).mean() > 4 * error.mean()
+
+
+def test_samples_change_nothing_but_colour(session: runtime.Session) -> None:
+    one, four = look(Street.generate(0)), look(Street.generate(0), samples=4)
+    assert np.array_equal(one.depth, four.depth)
+    assert np.array_equal(one.labels, four.labels)
+    assert not np.array_equal(one.colour, four.colour)
+    assert np.abs(one.colour - four.colour).mean() < 0.05
+
+
+def test_foreground_is_what_the_labels_say() -> None:
+    assert {label for label in Label if not background(np.array([label], np.uint8))[0]} == set(FOREGROUND)
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_background_without_foreground(session: runtime.Session, seed: int) -> None:
+    """Bit for bit the whole street's where no foreground is, but for its shadows, and never nearer behind it."""
+    whole, bare = look(Street.generate(seed)), look(Street.generate(seed), foreground=False)
+    assert background(bare.labels).all()
+    seen = background(whole.labels)
+    assert 0.1 < (~seen).mean() < 0.9
+    assert np.array_equal(whole.depth[seen], bare.depth[seen])
+    assert np.array_equal(whole.labels[seen], bare.labels[seen])
+    assert np.all(bare.depth[~seen] >= whole.depth[~seen])
+    lightened = (bare.colour - whole.colour)[0][:, seen[0, 0]]
+    assert lightened.min() >= -1e-6  # a shadow can only go
+    assert 0.5 < np.all(lightened == 0, axis=0).mean() < 1
+    far = seen & (whole.labels == Label.SKY)
+    assert np.array_equal(whole.colour[0][:, far[0, 0]], bare.colour[0][:, far[0, 0]])
+
+
+def test_instances_are_cars_and_people(session: runtime.Session) -> None:
+    street = Street.generate(1)
+    frame, later = look(street, instances=True), look(street, t=0.1, instances=True)
+    plain = look(street)
+    assert plain.instances is None
+    assert np.array_equal(plain.colour, frame.colour)
+    moving = frame.instances > 0
+    assert frame.instances.min() == 0
+    assert 0.005 < moving.mean() < 0.5
+    assert np.isin(frame.labels[moving], (Label.CAR, Label.PERSON)).all()
+    for name in np.unique(frame.instances[moving]):
+        assert len(np.unique(frame.labels[frame.instances == name])) == 1
+    large = [name for name in np.unique(frame.instances[moving]) if (frame.instances == name).sum() > 30]
+    assert len(large) >= 2
+    assert set(large) <= set(np.unique(later.instances))
 
 
 @pytest.mark.parametrize(
@@ -122,6 +196,7 @@ def test_drives_forward_and_stays_in_its_lane() -> None:
         ({"K": np.eye(4)}, r"`K` must be \[1, 3, 3\] or \[3, 3\], got \[4, 4\]"),
         ({"K": -np.eye(3)}, "`K` must have positive focal lengths"),
         ({"t": float("nan")}, "`t` must be one or 1 finite times"),
+        ({"samples": 0}, "`samples` must be a positive integer, got 0"),
     ],
 )
 def test_refuses(changes: dict[str, Any], message: str) -> None:

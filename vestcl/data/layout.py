@@ -1,7 +1,7 @@
 """What stands and moves along the procedural street, and where.
 
 The street is built in blocks of BLOCK metres, each from the seed and its own index, so that any stretch of it can be
-built alone; moving cars and pedestrians go in endless files of constant velocity.
+built alone; moving cars and pedestrians go in endless files, see vestcl/data/street_traffic.py.
 """
 
 import functools
@@ -37,17 +37,17 @@ class Layout:
 
 @dataclass(frozen=True)
 class File:
-    """Cars or pedestrians that follow each other at constant velocity, one in each slot of ``spacing`` metres."""
+    """Cars or pedestrians that follow each other, one in each slot of ``spacing`` metres."""
 
     tag: int
     kind: str
     """"car" or "pedestrian"."""
     x: float
     speed: float
-    """Metres a second along +z; negative walks and faces the other way."""
+    """Mean, metres a second along +z; negative goes and faces the other way."""
     spacing: float
     gap: int | None = None
-    """A slot that stays empty: the camera's own."""
+    """A slot that stays empty: the camera's own, whose drive this file follows."""
 
 
 # ---------------------------------------------------------------- what stands still
@@ -141,21 +141,11 @@ def _side_street(layout: Layout, rng: np.random.Generator, side: int, length: fl
 
 
 @functools.lru_cache(maxsize=1024)
-def _member(layout: Layout, file: File, slot: int) -> tuple[Solids, float]:
-    """Who walks or drives in ``slot``, and how far from the slot's middle."""
+def member(layout: Layout, file: File, slot: int) -> tuple[Solids, float]:
+    """Who walks or drives in ``slot``, standing at z = 0, and how many metres from the slot's middle."""
     rng = _rng(layout.seed, 20 + file.tag, slot)
     yaw = 0.0 if file.speed > 0 else np.pi
     car = file.kind == "car"
     made = objects.car(rng) if car else objects.pedestrian(rng)
     offset = 0.22 * file.spacing * rng.uniform(-1, 1)
     return objects.placed(made, file.x + rng.uniform(-0.2, 0.2), 0.0 if car else -PAVEMENT_HEIGHT, 0.0, yaw), offset
-
-
-def members(layout: Layout, file: File, t: float, low: float, high: float) -> Iterator[tuple[Solids, float]]:
-    """The members of ``file`` between z = ``low`` and ``high`` at time ``t``, with their z."""
-    start = file.speed * t
-    first, last = (int(np.floor((z - start) / file.spacing)) for z in (low, high))
-    for slot in range(first, last + 1):
-        if slot != file.gap:
-            solids, offset = _member(layout, file, slot)
-            yield solids, slot * file.spacing + offset + start

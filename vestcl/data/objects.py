@@ -65,7 +65,7 @@ def solid(
     seed: int = 0,
 ) -> Solids:
     """One solid, [1], unturned; see kernels/raycast_types.h for its fields."""
-    return np.array([(centre, half_size, (1.0, 0.0), taper, tint, shape, material, label, seed)], SOLID)
+    return np.array([(centre, half_size, (1.0, 0.0), taper, tint, shape, material, label, seed, 0)], SOLID)
 
 
 def placed(solids: Solids, x: float, y: float, z: float, yaw: float = 0.0) -> Solids:

@@ -64,6 +64,10 @@ class Label(IntEnum):
     CAR = 13
 
 
+#: Those of them that are foreground (SPEC section 3.2).
+FOREGROUND: Final = (Label.POLE, Label.PERSON, Label.CAR)
+
+
 #: One solid, as kernels/raycast_types.h lays it out. Axes and metres as everywhere; tint is linear RGB.
 SOLID: Final = np.dtype(
     [
@@ -76,6 +80,7 @@ SOLID: Final = np.dtype(
         ("material", np.int32),
         ("label", np.int32),
         ("seed", np.uint32),
+        ("instance", np.int32),
     ]
 )
 
@@ -107,6 +112,9 @@ class Frame:
     """[B,1,H,W], z-depth in metres; SKY_DEPTH where there is sky."""
     labels: NDArray[np.uint8]
     """[B,1,H,W], Cityscapes train ids, see `Label`."""
+    instances: NDArray[np.int32] | None = None
+    """[B,1,H,W], one number for each car and person that moves, the same at all times; 0 stands still. None if it was
+    not asked for."""
 
 
 @dataclass(frozen=True)
@@ -127,17 +135,23 @@ class Scene:
     """Of the road's and the sky's texture."""
 
 
-def blank_frame(batch: int, height: int, width: int) -> Frame:
-    """A `Frame` of ``batch`` images whose arrays are still to be written."""
+def blank_frame(batch: int, height: int, width: int, instances: bool = False) -> Frame:
+    """A `Frame` of ``batch`` images whose arrays are still to be written, with or without ``instances``."""
     return Frame(
         np.empty((batch, 3, height, width), np.float32),
         np.empty((batch, 1, height, width), np.float32),
         np.empty((batch, 1, height, width), np.uint8),
+        np.empty((batch, 1, height, width), np.int32) if instances else None,
     )
 
 
 def cast(
-    scene: Scene, camera_from_world: NDArray[np.float64], K: NDArray[np.float64], frame: Frame, index: int
+    scene: Scene,
+    camera_from_world: NDArray[np.float64],
+    K: NDArray[np.float64],
+    frame: Frame,
+    index: int,
+    samples: int = 1,
 ) -> None:
     """Fill image ``index`` of ``frame``.
 
@@ -147,6 +161,8 @@ def cast(
         K: [3,3] intrinsics in pixels, last row (0, 0, 1).
         frame: where the result goes, from `blank_frame`.
         index: which image of the batch.
+        samples: samples x samples rays a pixel for colour, averaged in linear light; 0 leaves colour unwritten. All
+            the rest is of the ray through the pixel's centre.
     """
     height, width = frame.depth.shape[2:]
     count = len(scene.solids)
@@ -155,7 +171,7 @@ def cast(
     tile_rows, tile_columns = -(-height // tile), -(-width // tile)
     cells = int(2 * SHADOW_REACH / SHADOW_CELL)
     crossings = scene.crossings if len(scene.crossings) else np.zeros((1, 2), np.float32)
-    inputs = (_view(scene, camera_from_world, K), scene.solids, crossings)
+    inputs = (_view(scene, camera_from_world, K, samples), scene.solids, crossings)
     with runtime.current().job() as job:
         view, solids, side_streets = (job.read(array) for array in inputs)
         image_rects, shadow_cells = job.scratch(4 * count, np.int32), job.scratch(4 * count, np.int32)
@@ -167,9 +183,15 @@ def cast(
         _launch(job, "list_solids", (tile_rows,), [*_int32(tile_columns, tile, count), *tiles])
         _launch(job, "list_solids", (cells,), [*_int32(cells, 1, count), shadow_cells, *cell_lists])
         sizes = _int32(height, width, tile_columns, count, len(scene.crossings), cells, cells)
-        outputs = [job.write(array[index]) for array in (frame.colour, frame.depth, frame.labels)]
-        arguments = [*sizes, view, solids, *tiles, shadow_rects, *cell_lists, side_streets, *outputs]
+        wanted = _int32(samples, frame.instances is not None)
+        scenery = [view, solids, *tiles, shadow_rects, *cell_lists, side_streets]
+        arguments = [*sizes, *wanted, *scenery, *_outputs(job, frame, index)]
         _launch(job, "raycast", (tile_rows * tile_columns, tile), arguments, (1, tile))
+
+
+def _outputs(job: runtime.Job, frame: Frame, index: int) -> list[runtime.Argument]:
+    outputs: list[runtime.Argument] = [job.write(a[index]) for a in (frame.colour, frame.depth, frame.labels)]
+    return [*outputs, job.scratch(1, np.int32) if frame.instances is None else job.write(frame.instances[index])]
 
 
 def _launch(
@@ -194,14 +216,16 @@ def _lists(job: runtime.Job, cells: int, count: int) -> tuple[runtime.Argument, 
     return job.scratch(cells * count, np.uint16), job.scratch(cells, np.int32)
 
 
-def _view(scene: Scene, camera_from_world: NDArray[np.float64], K: NDArray[np.float64]) -> NDArray[np.void]:
+def _view(
+    scene: Scene, camera_from_world: NDArray[np.float64], K: NDArray[np.float64], samples: int
+) -> NDArray[np.void]:
     rotation, translation = camera_from_world[:3, :3], camera_from_world[:3, 3]
     view = np.zeros(1, _VIEW)
     view["ray"] = rotation.T @ np.linalg.inv(K)
     view["project"] = K @ rotation
     view["camera"] = -rotation.T @ translation
     view["sun"] = scene.sun
-    view["pixel"] = 1 / K[0, 0]
+    view["pixel"] = 1 / (K[0, 0] * max(samples, 1))
     view["lane"], view["kerb"] = scene.lane, scene.kerb
     # The grid starts at a multiple of a cell in the world, lest shadows depend on where the camera is.
     view["grid"] = -SHADOW_REACH - np.mod(view["camera"][0, [0, 2]], SHADOW_CELL)

@@ -1,18 +1,26 @@
 """The procedural street: an endless, seeded driving scene with exact colour, depth and labels at any time.
 
 World axes: x right, y down, z forward along the road, metres; the road is y = 0 and its centre line x = 0. Traffic
-keeps right, and never ends: see vestcl/data/layout.py.
+keeps right, and never ends: see vestcl/data/layout.py and street_traffic.py. How the camera drives: street_drive.py.
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.data import layout
-from vestcl.data.layout import BLOCK, CROSSING, PAVEMENT_HEIGHT, File, Layout
-from vestcl.data.raycast import Frame, Material, Scene, blank_frame, cast
+from vestcl.data.layout import BLOCK, CROSSING, Layout
+from vestcl.data.raycast import FOREGROUND, SOLID, Frame, Label, Material, Scene, blank_frame, cast
+from vestcl.data.street_camera import check_cameras, check_pose, check_samples, intrinsics
+from vestcl.data.street_drive import Drive, Recording, Sway, world_from_camera
+from vestcl.data.street_traffic import Mover, Traffic
+
+if TYPE_CHECKING:  # it needs torch, which takes seconds to import
+    from vestcl.data.sample import Clip
+
+__all__ = ["Street", "intrinsics"]
 
 #: How far ahead of the camera the street is built, metres: there the haze hides a house appearing.
 AHEAD: Final = 300.0
@@ -20,17 +28,8 @@ AHEAD: Final = 300.0
 #: How far behind the camera, metres: shadows and wide views.
 BEHIND: Final = 60.0
 
-#: The camera's height above the road in metres, as on KITTI's car.
+#: The camera's usual height above the road in metres, as on KITTI's car.
 CAMERA_HEIGHT: Final = 1.65
-
-#: Focal length over image width, as in KITTI.
-FOCAL_SHARE: Final = 0.58
-
-
-def intrinsics(height: int, width: int) -> NDArray[np.float64]:
-    """K [3,3] of a KITTI-like camera: focal length FOCAL_SHARE * width, principal point in the middle."""
-    focal = FOCAL_SHARE * width
-    return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -46,31 +45,37 @@ class Street:
     """Width of the pavements, metres."""
     sun: tuple[float, float, float]
     """Unit vector towards it."""
-    speed: float
-    """Of the camera, metres a second."""
-    phase: float
-    """Of the camera's sway, radians."""
+    drive: Drive
+    """How the camera moves, and with it the cars of its lane."""
 
     @classmethod
-    def generate(cls, seed: int) -> "Street":
-        """The street of ``seed``, a non-negative integer. Equal seeds give equal streets.
+    def generate(cls, seed: int, trajectory: ArrayLike | None = None) -> "Street":
+        """The street of ``seed``. Equal arguments give equal streets.
+
+        Args:
+            seed: a non-negative integer.
+            trajectory: [N,4,4] world_from_cam of a real drive in metres, 10 frames a second, N of 2 or more: the
+                camera takes over its speed and its sideways, vertical, yaw, pitch and roll wobble, but not its turns,
+                see `Recording.from_trajectory`. Beyond its end it is played backwards, then forwards again. Without
+                it, `Sway`.
 
         Raises:
-            ValueError: ``seed`` is negative or no integer.
+            ValueError: ``seed`` is negative or no integer, or ``trajectory`` no rigid motions.
         """
         if not isinstance(seed, int | np.integer) or seed < 0:
             raise ValueError(f"`seed` must be a non-negative integer, got {seed!r}")
         rng = np.random.default_rng([seed, 0])
         height, turn = np.radians(rng.uniform(36, 50)), np.radians(rng.uniform(20, 42)) * rng.choice([-1, 1])
         sun = (np.cos(height) * np.sin(turn), -np.sin(height), -np.cos(height) * np.cos(turn))
+        lane, parking, pavement = rng.uniform(3.1, 3.5), rng.uniform(2.1, 2.4), rng.uniform(3.4, 4.4)
+        sway = Sway(speed=rng.uniform(8.0, 11.0), phase=rng.uniform(0, 2 * np.pi))
         return cls(
             seed=int(seed),
-            lane=rng.uniform(3.1, 3.5),
-            parking=rng.uniform(2.1, 2.4),
-            pavement=rng.uniform(3.4, 4.4),
+            lane=lane,
+            parking=parking,
+            pavement=pavement,
             sun=(float(sun[0]), float(sun[1]), float(sun[2])),
-            speed=rng.uniform(8.0, 11.0),
-            phase=rng.uniform(0, 2 * np.pi),
+            drive=sway if trajectory is None else Recording.from_trajectory(trajectory),
         )
 
     @property
@@ -79,16 +84,22 @@ class Street:
         return self.lane + self.parking
 
     def camera_pose(self, t: float) -> NDArray[np.float64]:
-        """world_from_camera [4,4] at time ``t`` seconds: along the right lane, swaying gently, facing its heading."""
-        slow, fast = 0.45 * t + self.phase, 0.8 * t + self.phase
-        z = self.speed * t + 0.8 * np.sin(fast)
-        x = self.lane / 2 + 0.35 * np.sin(slow)
-        heading = np.arctan2(0.35 * 0.45 * np.cos(slow), self.speed + 0.8 * 0.8 * np.cos(fast))
-        yaw = heading + 0.02 * np.sin(0.31 * t + self.phase)
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        return np.array([[cos, 0, sin, x], [0, 1, 0, -CAMERA_HEIGHT], [-sin, 0, cos, z], [0, 0, 0, 1]])
+        """world_from_camera [4,4] at time ``t`` seconds: along the right lane, as `drive` moves."""
+        ahead, aside, down, *turn = self.drive.at(t)
+        return world_from_camera(self.lane / 2 + aside, down - CAMERA_HEIGHT, ahead, *turn)
 
-    def render(self, camera_from_world: ArrayLike, K: ArrayLike, height: int, width: int, t: ArrayLike = 0.0) -> Frame:
+    def render(
+        self,
+        camera_from_world: ArrayLike,
+        K: ArrayLike,
+        height: int,
+        width: int,
+        t: ArrayLike = 0.0,
+        *,
+        samples: int = 1,
+        foreground: bool = True,
+        instances: bool = False,
+    ) -> Frame:
         """What cameras see at times ``t``.
 
         Args:
@@ -97,6 +108,10 @@ class Street:
             height: of the images in pixels.
             width: of the images in pixels.
             t: seconds, one for all or [B].
+            samples: colour is the mean over samples x samples evenly spaced rays a pixel, taken in linear light as a
+                sensor sums it, before the display's curve. All the rest is of the ray through the pixel's centre.
+            foreground: False leaves out cars, people and poles (SPEC section 3.2) and their shadows.
+            instances: whether the frame tells which moving car or person each pixel shows.
 
         Returns:
             A `Frame` of B images.
@@ -104,72 +119,120 @@ class Street:
         Raises:
             ValueError: an argument has the wrong shape or a value that is no camera; the message names it.
         """
-        poses, cameras, times = _cameras(camera_from_world, K, height, width, t)
-        frame = blank_frame(len(poses), height, width)
+        poses, cameras, times = check_cameras(camera_from_world, K, height, width, t)
+        check_samples(samples)
+        frame = blank_frame(len(poses), height, width, instances)
         for index, (pose, camera, time) in enumerate(zip(poses, cameras, times, strict=True)):
-            cast(self._scene(pose, float(time)), pose, camera, frame, index)
+            cast(self._scene(pose, float(time), foreground), pose, camera, frame, index, samples)
         return frame
 
-    def _scene(self, camera_from_world: NDArray[np.float64], t: float) -> Scene:
+    def motion(
+        self,
+        cur_from_world: ArrayLike,
+        next_from_world: ArrayLike,
+        K: ArrayLike,
+        height: int,
+        width: int,
+        t_cur: float,
+        t_next: float,
+    ) -> NDArray[np.float32]:
+        """How what each pixel shows moves: u = x_next - x_cur, x_next = next_from_world (world_from_cur x_cur + d).
+
+        x_cur is the point that the ray through the pixel's centre meets at ``t_cur``, in that camera's frame; d, in the
+        world, is how far its car or person gets until ``t_next``, 0 for what stands still. The sky, SKY_DEPTH away,
+        only turns: u = R x_cur - x_cur.
+
+        Args:
+            cur_from_world: [4,4], the camera at ``t_cur``.
+            next_from_world: [4,4], the camera at ``t_next``.
+            K: [3,3] intrinsics of the camera at ``t_cur``, pixel centres at +0.5, last row (0, 0, 1).
+            height: of its image in pixels.
+            width: of its image in pixels.
+            t_cur: seconds.
+            t_next: seconds.
+
+        Returns:
+            displacement_xyz [3,H,W], metres.
+
+        Raises:
+            ValueError: an argument has the wrong shape or a value that is no camera; the message names it.
+        """
+        cur, after = check_pose("cur_from_world", cur_from_world), check_pose("next_from_world", next_from_world)
+        _, cameras, times = check_cameras(np.stack([cur, after]), K, height, width, [t_cur, t_next])
+        frame = blank_frame(1, height, width, instances=True)
+        cast(self._scene(cur, float(times[0])), cur, cameras[0], frame, 0, samples=0)
+        assert frame.instances is not None
+        next_from_cur = after @ np.linalg.inv(cur)
+        per_metre = (next_from_cur[:3, :3] - np.eye(3)) @ np.linalg.inv(cameras[0])  # (R - I) x of a pixel at z = 1 m
+        u, v = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+        displacement = np.stack([frame.depth[0, 0] * (a * u + (b * v + c)) for a, b, c in per_metre])
+        displacement += np.where(frame.labels[0] == Label.SKY, 0.0, next_from_cur[:3, 3, None, None])
+        moving = frame.instances[0, 0] > 0
+        moved = self._displacements(cur, frame.instances[0, 0][moving], float(times[0]), float(times[1]))
+        displacement[:, moving] += after[:3, :3] @ moved
+        return displacement.astype(np.float32)
+
+    def clip(
+        self,
+        frames: int,
+        height: int,
+        width: int,
+        *,
+        start: float = 0.0,
+        fps: float = 10.0,
+        baseline: float = 0.54,
+        samples: int = 1,
+        foreground: bool = True,
+    ) -> "Clip":
+        """A drive down the street as any data set gives it, rendered when it is read; see `street_clip.clip`."""
+        from vestcl.data import street_clip  # torch comes with it
+
+        size = (height, width)
+        return street_clip.clip(
+            self, frames, size, start=start, fps=fps, baseline=baseline, samples=samples, foreground=foreground
+        )
+
+    def _displacements(
+        self, camera_from_world: NDArray[np.float64], instances: NDArray[np.int32], t_cur: float, t_next: float
+    ) -> NDArray[np.float64]:
+        """[3,N] metres in the world's axes: how far each of ``instances`` [N], none 0, gets."""
+        traffic, rows = self._traffic(), []
+        for mover in traffic.movers(t_cur, *self._stretch(camera_from_world)):
+            x0, y0, z0 = mover.position
+            x1, y1, z1 = traffic.position(mover, t_next)
+            rows.append((mover.instance, (x1 - x0, y1 - y0, z1 - z0)))
+        rows.sort()
+        names, ways = np.array([name for name, _ in rows], np.int32), np.array([way for _, way in rows]).reshape(-1, 3)
+        return ways[np.searchsorted(names, instances)].T
+
+    def _stretch(self, camera_from_world: NDArray[np.float64]) -> tuple[float, float]:
+        """The z in metres between which the street is built for a camera."""
         rotation = camera_from_world[:3, :3]
-        position, forward = -rotation.T @ camera_from_world[:3, 3], rotation[2, 2]
-        low = position[2] - (BEHIND if forward > 0.5 else AHEAD)
-        high = position[2] + (BEHIND if forward < -0.5 else AHEAD)
-        parts, offsets, plan = [], [], Layout(self.seed, self.kerb, self.pavement)
-        blocks = range(int(low // BLOCK), int(high // BLOCK) + 1)
-        for index in blocks:
-            parts.append(layout.block(plan, index))
-            offsets.append((0.0, 0.0, index * BLOCK))
-        for file in self._files():
-            for solids, z in layout.members(plan, file, t, low, high):
-                parts.append(solids)
-                side_street = file.kind == "pedestrian" and layout.is_crossing(self.seed, z)
-                offsets.append((0.0, PAVEMENT_HEIGHT if side_street else 0.0, z))
-        solids = np.concatenate(parts)
+        z, forward = float(-rotation[:, 2] @ camera_from_world[:3, 3]), rotation[2, 2]
+        return z - (BEHIND if forward > 0.5 else AHEAD), z + (BEHIND if forward < -0.5 else AHEAD)
+
+    def _scene(self, camera_from_world: NDArray[np.float64], t: float, foreground: bool = True) -> Scene:
+        position = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+        low, high = self._stretch(camera_from_world)
+        plan, blocks = self._plan(), range(int(low // BLOCK), int(high // BLOCK) + 1)
+        movers: list[Mover] = list(self._traffic().movers(t, low, high)) if foreground else []
+        parts = [*(layout.block(plan, index) for index in blocks), *(mover.solids for mover in movers)]
+        offsets = [*((0.0, 0.0, index * BLOCK) for index in blocks), *(mover.position for mover in movers)]
+        # As plain bytes, because NumPy compares the fields' names of all parts, which takes a millisecond.
+        solids = np.concatenate([part.view(f"V{SOLID.itemsize}") for part in parts]).view(SOLID)
         counts = [len(part) for part in parts]
         solids["centre"] += np.repeat(np.array(offsets) - position, counts, axis=0)
+        solids["instance"] = np.repeat([*(0 for _ in blocks), *(mover.instance for mover in movers)], counts)
+        if not foreground:
+            solids = solids[~np.isin(solids["label"], FOREGROUND)]
         # Leaves last: their noise is looked up only where nothing nearer was hit.
         solids = solids[np.argsort(solids["material"] == Material.FOLIAGE, kind="stable")]
         ends = [(index + 1) * BLOCK for index in blocks if layout.has_crossing(self.seed, index)]
         crossings = np.array([(end - CROSSING, end) for end in ends], np.float32).reshape(-1, 2)
         return Scene(solids, crossings, self.sun, self.lane, self.kerb, self.seed)
 
-    def _files(self) -> tuple[File, ...]:
-        walk = self.kerb + self.pavement
-        return (
-            File(1, "car", self.lane / 2, self.speed, 27.0, gap=0),
-            File(2, "car", -self.lane / 2, -0.9 * self.speed, 31.0),
-            File(3, "pedestrian", walk - 0.8, 1.3, 17.0),
-            File(4, "pedestrian", walk - 1.6, -1.2, 23.0),
-            File(5, "pedestrian", 0.8 - walk, -1.35, 19.0),
-            File(6, "pedestrian", 1.6 - walk, 1.25, 29.0),
-        )
+    def _plan(self) -> Layout:
+        return Layout(self.seed, self.kerb, self.pavement)
 
-
-def _cameras(
-    camera_from_world: ArrayLike, K: ArrayLike, height: int, width: int, t: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """The arguments of `Street.render`, checked and with one entry an image."""
-    poses, cameras = np.asarray(camera_from_world, np.float64), np.asarray(K, np.float64)
-    times = np.asarray(t, np.float64)
-    for name, size in (("height", height), ("width", width)):
-        if not isinstance(size, int | np.integer) or size < 1:
-            raise ValueError(f"`{name}` must be a positive integer, got {size!r}")
-    if poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3):
-        raise ValueError(f"`camera_from_world` must be [B, 4, 4] or [4, 4], got {list(poses.shape)}")
-    poses = poses.reshape(-1, 4, 4)
-    batch = len(poses)
-    if cameras.shape not in ((3, 3), (batch, 3, 3)):
-        raise ValueError(f"`K` must be [{batch}, 3, 3] or [3, 3], got {list(cameras.shape)}")
-    if times.shape not in ((), (batch,)) or not np.isfinite(times).all():
-        raise ValueError(f"`t` must be one or {batch} finite times in seconds, got {t!r}")
-    rotation = poses[:, :3, :3]
-    square = rotation @ rotation.transpose(0, 2, 1)
-    rigid = np.allclose(square, np.eye(3), atol=1e-4) and np.all(np.linalg.det(rotation) > 0)
-    if not (rigid and np.isfinite(poses).all() and np.array_equal(poses[:, 3], [[0, 0, 0, 1]] * batch)):
-        raise ValueError("`camera_from_world` must be rigid transforms: orthonormal rotations, last row (0, 0, 0, 1)")
-    cameras = np.broadcast_to(cameras, (batch, 3, 3))
-    sound = np.isfinite(cameras).all() and np.all(cameras[:, [0, 1], [0, 1]] > 0)
-    if not (sound and np.array_equal(cameras[:, 2], [[0, 0, 1]] * batch)):
-        raise ValueError("`K` must have positive focal lengths and the last row (0, 0, 1)")
-    return poses, cameras, np.broadcast_to(times, (batch,))
+    def _traffic(self) -> Traffic:
+        return Traffic(self._plan(), self.lane, self.drive)
