@@ -2,28 +2,21 @@
 
 import subprocess
 import sys
-import types
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
+from stand_ins import put_module
 
 from vestcl import __version__, cli, doctor, runtime
+from vestcl.io.labels import LabelKind
 
 
 @pytest.fixture(autouse=True)
 def _wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.delenv("VESTCL_DEVICE", raising=False)
-
-
-def put_module(monkeypatch: pytest.MonkeyPatch, name: str, **members: object) -> None:
-    """A stand-in for module ``name``, wherever it is imported from."""
-    module = types.ModuleType(name)
-    vars(module).update(members)
-    monkeypatch.setitem(sys.modules, name, module)
-    package, _, stem = name.rpartition(".")
-    monkeypatch.setattr(sys.modules[package], stem, module, raising=False)
 
 
 def test_devices_marks_the_one_in_use(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,9 +70,12 @@ def test_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     assert runtime.current() is before
 
 
-def test_a_value_error_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("kind", [ValueError, PermissionError, FileNotFoundError, runtime.DeviceError])
+def test_what_a_user_can_put_right_is_one_line(
+    kind: type[Exception], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def run(*_: object) -> None:
-        raise ValueError("`height` must be positive, got 0")
+        raise kind("`height` must be positive, got 0")
 
     put_module(monkeypatch, "vestcl.demo", run=run)
     assert cli.main(["demo", "--height", "0"]) == 2
@@ -93,14 +89,51 @@ def test_bench(monkeypatch: pytest.MonkeyPatch) -> None:
 
         points: int = 1000
 
-    configs = []
+    configs: list[object] = []
     put_module(monkeypatch, "vestcl.bench")
     put_module(monkeypatch, "vestcl.bench.splat", SplatBench=SplatBench, main=configs.append)
     assert cli.main(["bench", "splat"]) == 0
     assert cli.main(["bench", "splat", "--points", "5"]) == 0
     assert configs == [SplatBench(1000), SplatBench(5)]
-    with pytest.raises(SystemExit):
-        cli.main(["bench"])
+    for mistake in ([], ["abacus"], ["inpaint"]):  # this stand-in has no bench of that name
+        with pytest.raises(SystemExit):
+            cli.main(["bench", *mistake])
+
+
+def test_a_bench_does_not_need_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass(frozen=True)
+    class NetworkBench:
+        """Time a network."""
+
+        width: int = 832
+
+    configs: list[object] = []
+    put_module(monkeypatch, "vestcl.bench")
+    put_module(monkeypatch, "vestcl.bench.network", NetworkBench=NetworkBench, main=configs.append)
+    assert cli.main(["bench", "network", "--width", "9"]) == 0
+    assert configs == [NetworkBench(9)]
+
+
+def test_a_bench_that_lacks_a_package_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lacks(name: str) -> None:
+        raise ModuleNotFoundError("No module named 'abacus'", name="abacus")
+
+    monkeypatch.setattr(cli, "import_module", lacks)
+    with pytest.raises(ModuleNotFoundError, match="abacus"):
+        cli.main(["bench", "splat"])
+
+
+def test_help_of_forecast_needs_no_torch() -> None:
+    code = (
+        "import sys\nfrom vestcl import cli\n"
+        "try:\n    cli.main(['forecast', '--help'])\nexcept SystemExit as end:\n"
+        "    sys.exit(end.code or 'torch' in sys.modules or 'cv2' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_label_ids_are_those_of_the_readers() -> None:
+    assert get_args(get_type_hints(cli.Forecast)["label_ids"]) == get_args(LabelKind)
 
 
 def test_doctor_tells_what_works(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,10 +1,12 @@
-"""The command line: `vestcl devices`, `doctor`, `demo` and `bench`. Whatever imports torch is imported late."""
+"""The command line: `vestcl forecast`, `devices`, `doctor`, `demo`, `bench`. What imports torch is imported late."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, Final, Literal
 
 import tyro
 from rich import box
@@ -13,6 +15,14 @@ from rich.table import Table
 from rich.text import Text
 
 from vestcl import __version__, doctor, runtime
+
+#: Module of vestcl.bench -> its settings; each has a ``main`` that takes them.
+_BENCHES: Final = {
+    "splat": "SplatBench",
+    "network": "NetworkBench",
+    "inpaint": "InpaintBench",
+    "forecast": "ForecastBench",
+}
 
 
 @dataclass(frozen=True)
@@ -96,8 +106,74 @@ class Demo:
 
 
 @dataclass(frozen=True)
+class Forecast:
+    """Forecast the next frames of a driving clip, and show them from other cameras.
+
+    The folder OUT gets pictures, OpenEXR and a video of each view, and forecast.json.
+    """
+
+    input: tyro.conf.Positional[str]
+    """A KITTI raw drive, a KITTI odometry sequence, a frame of Cityscapes, a scene of Virtual KITTI 2, a folder with
+    camera.json, a video, or street:SEED for a procedural street."""
+    out: Path = Path("out")
+    """Folder for the files; those of an earlier forecast are replaced one by one."""
+    steps: int = 5
+    """Frames to forecast."""
+    view: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Where to look from: source, right, left, or x,y,z[,yaw=][,pitch=][,roll=][,fov=][,name=], as in
+    "0.5,0,0,yaw=-5": metres to the right of, below and ahead of the source camera, and degrees to the right, up and
+    clockwise. Without it: source."""
+    frame: int | None = None
+    """The current frame t, counted from 0; it and the ones before it are seen. Without it: the last one, or with
+    --compare the last that has STEPS true frames after it."""
+    compare: bool = False
+    """Score the forecast, and two baselines, against the frames that the clip goes on with."""
+    squeeze: Path | None = None
+    """With --compare: SqueezeNet 1.0 weights for a distance in its features."""
+    height: int | None = None
+    """Pixels; without it as the clip is, or in proportion to --width."""
+    width: int | None = None
+    """Pixels; without it as the clip is, or in proportion to --height."""
+    fov: float | None = None
+    """Horizontal field of view in degrees, of a video or a folder without camera.json."""
+    depth: Path | None = None
+    """Folder of depth files (.png, .exr, .npy) with the frames' names."""
+    depth_scale: float | None = None
+    """Their units per metre; PNG needs it (KITTI 256)."""
+    labels: Path | None = None
+    """Folder of label PNGs with the frames' names."""
+    label_ids: Literal["trainIds", "labelIds", "virtual_kitti"] = "trainIds"
+    """What they hold."""
+    depth_model: str | None = None
+    """Estimate depth by this checkpoint (a folder, or a name on huggingface.co)."""
+    mask_model: str | None = None
+    """Estimate classes by this checkpoint (a folder, or a name on huggingface.co)."""
+    rig: str | None = None
+    """KITTI: colour or grey cameras."""
+    sequence: str | None = None
+    """KITTI odometry: which one, if there are several."""
+    snippet: str | None = None
+    """Cityscapes: name of the annotated frame, if there are several."""
+    variant: str | None = None
+    """Virtual KITTI: clone, fog ..., if there are several."""
+    gif: bool = False
+    """Write an animated GIF of each view, too."""
+    exr: bool = True
+    """Write each frame's colour, depth, coverage and 3D motion as OpenEXR."""
+    device: str | None = None
+    """OpenCL device: an index of `vestcl devices` or a part of its name."""
+
+    def run(self) -> int:
+        """Forecast and write."""
+        from vestcl import forecast_command
+
+        forecast_command.run(self)
+        return 0
+
+
+@dataclass(frozen=True)
 class Bench:
-    """Time an operator on an OpenCL device: `vestcl bench splat`."""
+    """Time a part of vestcl: `vestcl bench splat`, `network`, `inpaint` or `forecast`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -114,21 +190,43 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if arguments[:1] == ["bench"]:
             return _bench(arguments[1:])
         return _command(arguments)
-    except (runtime.DeviceError, ValueError) as error:
+    except (runtime.DeviceError, ValueError, OSError) as error:
         Console(stderr=True).print(Text(f"error: {error}", style="red"), soft_wrap=True)
         return 2
 
 
 def _command(arguments: Sequence[str]) -> int:
-    commands: dict[str, Callable[..., Any]] = {"devices": Devices, "doctor": Doctor, "demo": Demo, "bench": Bench}
-    about = "Differentiable point splatting in OpenCL. `vestcl --version` tells the version."
+    commands: dict[str, Callable[..., Any]] = {
+        "forecast": Forecast,
+        "devices": Devices,
+        "doctor": Doctor,
+        "demo": Demo,
+        "bench": Bench,
+    }
+    about = "Forecasts of driving video from new views, in OpenCL. `vestcl --version` tells the version."
     command = tyro.extras.subcommand_cli_from_dict(commands, prog="vestcl", description=about, args=arguments)
     return int(command.run())
 
 
 def _bench(arguments: Sequence[str]) -> int:
-    from vestcl.bench import splat
-
-    config = tyro.extras.subcommand_cli_from_dict({"splat": splat.SplatBench}, prog="vestcl bench", args=arguments)
-    splat.main(config)
+    """Import the bench that is asked for and no other, so that one which can't be imported stands in nobody's way."""
+    asked = [name for name in _BENCHES if arguments[:1] == [name]]
+    modules = _bench_modules(asked) or _bench_modules(_BENCHES)
+    configs = {name: getattr(module, _BENCHES[name]) for name, module in modules.items()}
+    config = tyro.extras.subcommand_cli_from_dict(configs, prog="vestcl bench", args=arguments)
+    chosen = next(name for name, kind in configs.items() if type(config) is kind)
+    modules[chosen].main(config)
     return 0
+
+
+def _bench_modules(names: Iterable[str]) -> dict[str, ModuleType]:
+    """Those of ``names`` that this installation has."""
+    modules = {}
+    for name in names:
+        module = f"vestcl.bench.{name}"
+        try:
+            modules[name] = import_module(module)
+        except ModuleNotFoundError as error:
+            if error.name != module:
+                raise
+    return modules

@@ -1,0 +1,292 @@
+"""`vestcl forecast` from the command line to its files, on small clips and with a forecaster that repeats a frame."""
+
+import json
+import types
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from data_files import write_pictures, write_text
+from stand_ins import put_module
+
+from vestcl import cli, runtime
+from vestcl.data import Street
+from vestcl.data.sample import Clip, Sample
+from vestcl.forecast import Forecast, Rendered, View
+from vestcl.forecast_files import read_forecast
+from vestcl.io.video import Video
+from vestcl.models.trunks import Trunk
+
+HEIGHT, WIDTH, FRAMES = 24, 40, 6
+
+
+@dataclass
+class Repeater:
+    """In place of the forecaster: every view is frame t, and the calls are kept."""
+
+    calls: list[tuple[Clip, int, int, list[View]]] = field(default_factory=list)
+    devices: list[str] = field(default_factory=list)
+
+    def __call__(
+        self, clip: Clip, index: int, steps: int, views: Sequence[View], *, progress: Callable[[str, float], None]
+    ) -> Forecast:
+        self.calls.append((clip, index, steps, list(views)))
+        self.devices.append(runtime.current().info.index)
+        image = clip[index].read_image()
+        plane = np.ones_like(image[:1])
+        progress("repeat", 0.5)
+        rendered = Rendered(image, 10 * plane, plane, 0 * image)
+        return Forecast("repeater", [np.eye(4)] * steps, [{v.name: rendered for v in views}] * steps, {"repeat": 0.25})
+
+
+@pytest.fixture
+def repeater(monkeypatch: pytest.MonkeyPatch) -> Repeater:
+    repeater = Repeater()
+    put_module(monkeypatch, "vestcl.geometric", forecast_clip=repeater)
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.delenv("VESTCL_DEVICE", raising=False)
+    return repeater
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A stereo clip of noise."""
+    folder = tmp_path / "clip"
+    for side in ("image", "right"):
+        write_pictures(folder / side, [f"{i:04}.png" for i in range(FRAMES)], HEIGHT, WIDTH)
+    camera = {"fx": 40, "fy": 40, "cx": 19.5, "cy": 11.5, "fps": 25, "baseline": 0.5}
+    write_text(folder / "camera.json", json.dumps(camera))
+    return folder
+
+
+def test_everything_at_once(
+    folder: Path, tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, last, before = tmp_path / "out", runtime.devices()[-1].index, runtime.current()
+    told = f"forecast {folder} --out {out} --steps 2 --view right --view source --view -0.5,0,0,yaw=5,name=side"
+    assert cli.main([*told.split(), "--compare", "--gif", "--device", last]) == 0
+    ((clip, index, steps, views),) = repeater.calls
+    assert (len(clip), index, steps, [view.name for view in views]) == (6, 3, 2, ["right", "source", "side"])
+    assert repeater.devices == [last]
+    assert runtime.current() is before
+    saved = read_forecast(out)
+    assert np.array_equal(saved.image(2, "side"), clip[3].read_image())
+    depth = saved.frame(1, "side").depth
+    assert depth is not None and (depth == 10).all()
+    assert saved.about["settings"]["view"] == ["right", "source", "-0.5,0,0,yaw=5,name=side"]
+    assert set(saved.about["scores"]) == {"right", "source"}
+    scores = saved.about["scores"]["source"]
+    assert scores["forecast"] == scores["repeat last"]
+    assert len(scores["optical flow"]) == 2
+    assert list(saved.about["seconds"]) == ["open the clip", "repeat", "compare", "write the files"]
+    assert len(Video(out / "source" / "forecast.mp4")) == 4 + 2
+    assert sorted(path.name for path in (out / "source").iterdir()) == [
+        *("000001.exr", "000001.png", "000002.exr", "000002.png"),
+        *("forecast.gif", "forecast.mp4", "sheet.png"),
+    ]
+    said = capsys.readouterr().out
+    for name in ("PSNR, dB", "optical flow", "repeat", "0.25", f"{out}/side/000001.png ... 000002.png"):
+        assert name in said
+    assert f"{scores['forecast'][0]['psnr']:.2f}" in said
+    assert f"{out}/right/sheet.png" in said
+    assert saved.about["views"]["side"]["sheet"] == "side/sheet.png"
+
+
+def test_by_default_the_source_after_the_last_frame(folder: Path, tmp_path: Path, repeater: Repeater) -> None:
+    assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), "--no-exr"]) == 0
+    ((_, index, steps, views),) = repeater.calls
+    assert (index, steps, [view.name for view in views]) == (FRAMES - 1, 5, ["source"])
+    about = read_forecast(tmp_path / "out").about
+    assert "scores" not in about
+    assert set(about["views"]["source"]["frames"][0]) == {"image"}
+    assert not list(tmp_path.rglob("*.gif"))
+
+
+@pytest.mark.parametrize(
+    ("told", "size"),
+    [("--height 48", (48, 80)), ("--width 20", (12, 20)), ("--height 30 --width 20", (30, 20)), ("", (24, 40))],
+)
+def test_size(told: str, size: tuple[int, int], folder: Path, tmp_path: Path, repeater: Repeater) -> None:
+    assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), *told.split()]) == 0
+    clip = repeater.calls[0][0]
+    assert (clip[0].height, clip[0].width) == size
+    assert clip[0].K[0, 0] == pytest.approx(40 * size[1] / WIDTH)
+    assert read_forecast(tmp_path / "out").about["views"]["source"]["width"] == size[1]
+
+
+@pytest.mark.parametrize(("told", "index"), [("--frame 1", 1), ("--frame 4 --compare", 4), ("--frame 5", 5)])
+def test_frame(told: str, index: int, folder: Path, tmp_path: Path, repeater: Repeater) -> None:
+    assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), *told.split()]) == 0
+    assert repeater.calls[0][1] == index
+
+
+def test_files_beside_the_clip_and_options_of_its_layout(tmp_path: Path, repeater: Repeater) -> None:
+    bare = tmp_path / "bare"
+    write_pictures(bare, ["a.png", "b.png"], HEIGHT, WIDTH)
+    for name in ("a", "b"):
+        (tmp_path / "metres").mkdir(exist_ok=True)
+        np.save(tmp_path / "metres" / f"{name}.npy", np.full((HEIGHT, WIDTH), 7, np.float32))
+    told = f"forecast {bare} --out {tmp_path / 'out'} --fov 90 --depth {tmp_path / 'metres'}"
+    assert cli.main(told.split()) == 0
+    clip = repeater.calls[0][0]
+    assert clip[0].K[0, 0] == pytest.approx(WIDTH / 2)
+    assert (clip[1].read_depth() == 7).all()
+
+
+def test_estimators_take_the_place_of_files(
+    folder: Path, tmp_path: Path, repeater: Repeater, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[Any] = []
+
+    def with_estimates(clip: Clip, depth: str | None = None, segmentation: str | None = None) -> Clip:
+        calls.append((depth, segmentation))
+        return clip
+
+    def estimator(kind: str) -> type:
+        return type("Estimator", (), {"load": staticmethod(lambda name: f"{kind} of {name}")})
+
+    import vestcl.scene  # noqa: F401 - its attribute is put in place below
+
+    members = {"DepthEstimator": estimator("depth"), "SegmentationEstimator": estimator("classes")}
+    put_module(monkeypatch, "vestcl.scene.estimators", with_estimates=with_estimates, **members)
+    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1"]
+    assert cli.main([*told, "--depth-model", "zoe", "--mask-model", "former"]) == 0
+    assert cli.main([*told, "--depth-model", "zoe"]) == 0
+    assert cli.main(told) == 0
+    assert calls == [("depth of zoe", "classes of former"), ("depth of zoe", None)]
+
+
+def test_a_missing_extra_is_one_line(
+    folder: Path,
+    tmp_path: Path,
+    repeater: Repeater,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def load(name: str) -> None:
+        raise ImportError("pip install 'vestcl[estimators]'")
+
+    import vestcl.scene  # noqa: F401 - its attribute is put in place below
+
+    put_module(monkeypatch, "vestcl.scene.estimators", DepthEstimator=types.SimpleNamespace(load=load))
+    assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), "--depth-model", "zoe"]) == 2
+    assert capsys.readouterr().err == "error: pip install 'vestcl[estimators]'\n"
+
+
+@pytest.mark.parametrize(
+    ("told", "frames", "size", "index"),
+    [
+        ("", 4, (256, 832), 3),
+        ("--compare --steps 2", 6, (256, 832), 3),
+        ("--frame 9 --height 48 --width 64", 10, (48, 64), 9),
+        ("--frame 2 --compare --steps 3", 6, (256, 832), 2),
+    ],
+)
+def test_street(
+    told: str,
+    frames: int,
+    size: tuple[int, int],
+    index: int,
+    tmp_path: Path,
+    repeater: Repeater,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wanted = []
+
+    def clip(street: Street, frames: int, height: int, width: int) -> Clip:
+        wanted.append((street.seed, frames, (height, width)))
+        K = np.array([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
+        image = np.zeros((3, HEIGHT, WIDTH))
+        return Clip("street", "street", tuple(Sample.from_arrays(f"{i}", image, K) for i in range(frames)))
+
+    monkeypatch.setattr(Street, "clip", clip, raising=False)
+    assert cli.main(["forecast", "street:7", "--out", str(tmp_path / "out"), *told.split()]) == 0
+    assert wanted == [(7, frames, size)]
+    assert repeater.calls[0][1] == index
+
+
+def test_a_long_table_shows_some_steps(
+    folder: Path,
+    tmp_path: Path,
+    repeater: Repeater,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    write_pictures(folder / "image", [f"{i:04}.png" for i in range(14)], HEIGHT, WIDTH)
+    told = f"forecast {folder} --out {tmp_path / 'out'} --steps 12 --compare --no-exr"
+    assert cli.main(told.split()) == 0
+    said = capsys.readouterr().out
+    heading = next(line for line in said.splitlines() if "t+1" in line)
+    assert heading.split() == ["t+1", "t+4", "t+6", "t+9", "t+12", "mean"]
+    assert "view source, mean over 12" in said
+    scores = read_forecast(tmp_path / "out").about["scores"]["source"]["optical flow"]
+    values = [step["psnr"] for step in scores]
+    row = next(line for line in said.splitlines() if "optical flow" in line).split()
+    assert row[2:] == [f"{value:.2f}" for value in (*(values[step - 1] for step in (1, 4, 6, 9, 12)), np.mean(values))]
+
+
+def test_squeeze_weights(folder: Path, tmp_path: Path, repeater: Repeater) -> None:
+    torch.save(Trunk("squeezenet1_0").state_dict(), tmp_path / "squeeze.pth")
+    told = f"forecast {folder} --out {tmp_path / 'out'} --steps 1 --compare --squeeze {tmp_path / 'squeeze.pth'}"
+    assert cli.main(told.split()) == 0
+    assert read_forecast(tmp_path / "out").about["scores"]["source"]["forecast"][0]["squeeze"] > 0
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ("--steps 0", "`steps` must be 1 or more, got 0"),
+        ("--height 0", "`height` must be 1 or more, got 0"),
+        ("--frame 0", "`frame` must be 1 ... 5, to have a frame before it, got 0"),
+        ("--frame 6", "`frame` must be 1 ... 5, to have a frame before it, got 6"),
+        ("--frame 5 --compare", "must be 1 ... 4, to have a frame before it and one after it to compare with, got 5"),
+        ("--compare", "must have 7 frames to compare 5 steps, got 6"),
+        ("--compare --steps 1 --view 0,0,1", "`views` must have one with a truth to compare with"),
+        ("--view above", "`view` must be"),
+        ("--view right --view right", "got right twice"),
+        ("--squeeze x.pth", "`squeeze` is a distance to the truth; it needs `compare`"),
+        ("--squeeze x.pth --compare --steps 1", "no squeezenet1_0 weights at x.pth"),
+        ("--fov 90", "camera.json: tells the camera; leave out `fov`"),
+        ("--rig grey", "is folder, which takes fov, not rig"),
+        ("--depth nowhere", "nowhere: has no 0000 ending in .png, .exr, .npy"),
+        ("--device abacus", "VESTCL_DEVICE or selector 'abacus' fits none"),
+    ],
+)
+def test_mistakes_are_one_line(
+    told: str, message: str, folder: Path, tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), *told.split()]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert message in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_mistakes_with_the_input_are_one_line(
+    tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for told, message in (
+        ("nowhere", "nowhere: no such file or folder"),
+        ("street:x", "street:x: no such file or folder"),
+        ("street:0 --fov 9 --depth d", "street:0: is a street, which takes height and width, not fov, depth"),
+        ("street:0 --frame 0", "`frame` must be 1"),
+    ):
+        assert cli.main(["forecast", *told.split(), "--out", str(tmp_path / "out")]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_an_out_that_is_a_file_is_one_line(
+    folder: Path, tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = write_text(tmp_path / "taken", "mine")
+    assert cli.main(["forecast", str(folder), "--out", str(taken)]) == 2
+    assert capsys.readouterr().err == f"error: `out` must be a folder, got the file {taken}\n"
+    assert not repeater.calls
+    assert taken.read_text() == "mine\n"

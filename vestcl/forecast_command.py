@@ -1,0 +1,256 @@
+"""What `vestcl forecast` does: open a clip, forecast it, compare it with the truth, write it all, and say so."""
+
+import contextlib
+import dataclasses
+import functools
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from vestcl import compare, forecast_files, runtime, sheet
+from vestcl.compare import Comparison
+from vestcl.data.open import open_sequence
+from vestcl.data.sample import Clip
+from vestcl.forecast import Forecast, View
+from vestcl.models.trunks import load_trunk
+from vestcl.views import parse_views
+
+if TYPE_CHECKING:
+    from vestcl import cli
+
+#: An input that is no file: the procedural street of this seed.
+STREET: Final = re.compile(r"street:(\d+)")
+
+#: Frames of a street up to the current one where ``frame`` is not told, and its size in pixels: SPEC section 10.
+STREET_CONTEXT: Final = 4
+STREET_SIZE: Final = (256, 832)
+
+#: Steps in a table of scores, so that it fits 80 letters; forecast.json has all.
+STEPS_SHOWN: Final = 5
+
+#: Options that are passed on to the clip's reader, which knows whether it has them.
+_LAYOUT: Final = ("fov", "rig", "sequence", "snippet", "variant")
+
+#: Options of files beside a clip, with what they are if not given.
+_BESIDE: Final = {"depth": None, "depth_scale": None, "labels": None, "label_ids": "trainIds"}
+
+
+@dataclass
+class _Stages:
+    """The bar on the terminal, and how long each stage took."""
+
+    bar: Progress
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.task = self.bar.add_task("", total=1.0)
+
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[Callable[[float], None]]:
+        """Times the block; yields what it may tell its share done to."""
+        self.show(name, 0.0)
+        start = time.perf_counter()
+        yield lambda share: self.show(name, share)
+        self.seconds[name] = time.perf_counter() - start
+
+    def show(self, name: str, share: float) -> None:
+        """Draw the bar anew."""
+        self.bar.update(self.task, description=name, completed=share)
+
+
+def run(options: "cli.Forecast") -> None:
+    """Do what the options ask for.
+
+    Raises:
+        ValueError: an option out of range, or a file that is missing or malformed; the message names it.
+        DeviceError: no such OpenCL device.
+    """
+    _check(options)
+    console = Console()
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    with runtime.use(options.device), bar:
+        stages = _Stages(bar)
+        with stages.stage("open the clip"):
+            clip = open_clip(options)
+            index = current_frame(clip, options)
+            views = parse_views(options.view or ("source",), clip[index])
+            trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
+        forecast = _forecast(clip, index, options.steps, views, stages)
+        comparisons = []
+        if options.compare:
+            with stages.stage("compare") as report:
+                comparisons = compare.compare(forecast, clip, index, views, trunk, report)
+        with stages.stage(forecast_files.WRITING) as report:
+            details = _details(options, clip, index, forecast, comparisons)
+            told = dataclasses.replace(forecast, seconds=dict(stages.seconds))
+            write = functools.partial(forecast_files.write_forecast, exr=options.exr, gif=options.gif, report=report)
+            write(options.out, told, clip, index, views, details)
+    for comparison in comparisons:
+        console.print(_score_table(comparison))
+    _print_end(console, forecast_files.read_forecast(options.out))
+
+
+def open_clip(options: "cli.Forecast") -> Clip:
+    """The clip that the options tell, at the size they tell, with estimators in place of what they replace.
+
+    Raises:
+        ValueError: as `vestcl.data.open.open_sequence`; an option that a street does not have; an estimator whose
+            package or checkpoint is not there.
+    """
+    street = STREET.fullmatch(options.input)
+    beside = {name: getattr(options, name) for name in _BESIDE}
+    layout = {name: getattr(options, name) for name in _LAYOUT if getattr(options, name) is not None}
+    if street:
+        wrong = [*layout, *(name for name, unset in _BESIDE.items() if beside[name] != unset)]
+        if wrong:
+            raise ValueError(f"{options.input}: is a street, which takes height and width, not {', '.join(wrong)}")
+        return _with_estimates(_street(int(street[1]), options), options)
+    clip = open_sequence(options.input, **beside, **layout)
+    return _with_estimates(_resized(clip, options.height, options.width), options)
+
+
+def current_frame(clip: Clip, options: "cli.Forecast") -> int:
+    """The index t of the last frame that the forecast may see.
+
+    Without ``frame`` the clip's last one; to compare, the last one with ``steps`` true frames after it.
+
+    Raises:
+        ValueError: no such frame, none before it, or none after it to compare with.
+    """
+    last = len(clip) - 1
+    index = options.frame
+    if index is None:
+        index = last - options.steps if options.compare else last
+        if index < 1:
+            wanted = f"{options.steps + 2} frames to compare {options.steps} steps" if options.compare else "2 frames"
+            raise ValueError(f"{options.input}: must have {wanted}, got {last + 1}")
+    highest = last - 1 if options.compare else last
+    if not 1 <= index <= highest:
+        why = "have a frame before it" + (" and one after it to compare with" if options.compare else "")
+        raise ValueError(f"`frame` must be 1 ... {highest}, to {why}, got {index}")
+    return index
+
+
+def _check(options: "cli.Forecast") -> None:
+    for name in ("steps", "height", "width"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise ValueError(f"`{name}` must be 1 or more, got {value}")
+    if options.out.exists() and not options.out.is_dir():
+        raise ValueError(f"`out` must be a folder, got the file {options.out}")
+    if options.squeeze is not None and not options.compare:
+        raise ValueError("`squeeze` is a distance to the truth; it needs `compare`")
+
+
+def _street(seed: int, options: "cli.Forecast") -> Clip:
+    from vestcl.data.street import Street
+
+    current = STREET_CONTEXT - 1 if options.frame is None else options.frame
+    frames = current + 1 + (options.steps if options.compare else 0)
+    height, width = (given or usual for given, usual in zip((options.height, options.width), STREET_SIZE, strict=True))
+    return Street.generate(seed).clip(max(frames, 1), height, width)
+
+
+def _resized(clip: Clip, height: int | None, width: int | None) -> Clip:
+    """The clip at another size; a side that is not told follows the other."""
+    if height is None and width is None:
+        return clip
+    sample = clip[0]
+    if height is None and width is not None:
+        height = max(1, round(sample.height * width / sample.width))
+    elif width is None and height is not None:
+        width = max(1, round(sample.width * height / sample.height))
+    assert height is not None and width is not None
+    return clip.resized(height, width)
+
+
+def _with_estimates(clip: Clip, options: "cli.Forecast") -> Clip:
+    if options.depth_model is None and options.mask_model is None:
+        return clip
+    from vestcl.scene import estimators
+
+    try:
+        depth = None if options.depth_model is None else estimators.DepthEstimator.load(options.depth_model)
+        classes = None if options.mask_model is None else estimators.SegmentationEstimator.load(options.mask_model)
+    except ImportError as error:  # of the optional package; its message tells how to get it
+        raise ValueError(str(error)) from error
+    return estimators.with_estimates(clip, depth=depth, segmentation=classes)
+
+
+def _forecast(clip: Clip, index: int, steps: int, views: list[View], stages: _Stages) -> Forecast:
+    from vestcl import geometric
+
+    stages.show("forecast", 0.0)
+    forecast: Forecast = geometric.forecast_clip(clip, index, steps, views, progress=stages.show)
+    stages.seconds |= forecast.seconds
+    return forecast
+
+
+def _details(
+    options: "cli.Forecast", clip: Clip, index: int, forecast: Forecast, comparisons: list[Comparison]
+) -> forecast_files.Details:
+    """What forecast.json tells, and a sheet a view: beside the truth where it is known."""
+    what = f"{clip.name}, from frame {clip[index].name}, view "
+    compared = {each.view: each for each in comparisons}
+    sheets = {
+        name: compare.comparison_sheet(compared[name], what + name)
+        if name in compared
+        else sheet.forecast_sheet([frame[name] for frame in forecast.frames], what + name)
+        for name in forecast.frames[0]
+    }
+    scores = {name: comparison.scores for name, comparison in compared.items()} if options.compare else None
+    return forecast_files.Details(options.input, dataclasses.asdict(options), scores, sheets)
+
+
+def _score_table(comparison: Comparison) -> Table:
+    """A block of rows a metric, a row a method, a column a step: the first, the last and some between."""
+    count = len(comparison.truth)
+    shown = sorted({round(1 + (count - 1) * part / (STEPS_SHOWN - 1)) for part in range(STEPS_SHOWN)})
+    note = "; baselines: the right camera's own past" if comparison.stereo else ""
+    title = f"view {comparison.view}, mean over {count}{note}"
+    table = Table(box=box.SIMPLE, title=title, title_justify="left", pad_edge=False)
+    table.add_column("", no_wrap=True)
+    for heading in (*(f"t+{step}" for step in shown), "mean"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    known = comparison.scores[compare.FORECAST][0]
+    for metric in (metric for metric in compare.METRICS if metric in known):
+        name, digits = compare.METRICS[metric]
+        table.add_row(name)
+        for method, steps in comparison.scores.items():
+            values = [step[metric] for step in steps]
+            chosen = (*(values[step - 1] for step in shown), sum(values) / count)
+            table.add_row(f"  {method}", *(f"{value:{digits}}" for value in chosen))
+        table.add_section()
+    return table
+
+
+def _print_end(console: Console, saved: forecast_files.SavedForecast) -> None:
+    seconds: dict[str, float] = saved.about["seconds"]
+    table = Table("stage", box=box.SIMPLE)
+    table.add_column("seconds", justify="right")
+    for name, value in (seconds | {"all": sum(seconds.values())}).items():
+        table.add_row(name, f"{value:.2f}")
+    console.print(table)
+    for view in saved.about["views"].values():
+        for path in _paths(view):
+            console.print(Text(str(saved.folder / path)), soft_wrap=True)
+    console.print(Text(str(saved.folder / forecast_files.JSON)), soft_wrap=True)
+
+
+def _paths(view: dict[str, Any]) -> Iterator[Path]:
+    """The pictures as first ... last, then the files that there is one of."""
+    for kind in ("image", "exr"):
+        files = [Path(frame[kind]) for frame in view["frames"] if kind in frame]
+        if files:
+            yield files[0] if len(files) == 1 else files[0].with_name(f"{files[0].name} ... {files[-1].name}")
+    yield from (Path(view[kind]) for kind in ("video", "gif", "sheet") if kind in view)
