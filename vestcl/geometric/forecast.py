@@ -1,0 +1,163 @@
+"""Future frames from new views at constant velocity: the camera's, and each thing's own."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vestcl.data.sample import Clip
+from vestcl.forecast import Forecast, Rendered, View
+from vestcl.geometric.holes import fill_holes
+from vestcl.geometric.perception import Perception, Seen
+from vestcl.geometric.render import Cloud, holes, rendered, show
+from vestcl.scene.ego_motion import constant_velocity
+
+#: Of so many last motions the mean is extrapolated: two are smoother than one, and still follow a bend.
+_MOTIONS: Final = 2
+
+#: The name of this method in tables and files.
+METHOD: Final = "geometric"
+
+Progress = Callable[[str, float], None]
+
+
+def forecast_clip(
+    clip: Clip, index: int, steps: int, views: Sequence[View], *, progress: Progress | None = None
+) -> Forecast:
+    """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` alone.
+
+    Args:
+        clip: at its own size; its later frames and poses are not looked at.
+        index: the current frame t, 1 or more.
+        steps: frames to forecast, 1 or more.
+        views: cameras to show each from.
+        progress: called with the stage and the share of the work that is done.
+
+    Returns:
+        The forecast, of the clip's height and width.
+
+    Raises:
+        ValueError: no such frame or none before it, no steps, no views, or a clip that depth can't be had for.
+    """
+    done, total = [0.0], _stages(index) + steps * len(views)
+
+    def tell(stage: str) -> None:
+        if progress:
+            progress(stage, min(done[0] / total, 1.0))
+        done[0] += 1
+
+    return forecast_frames(Perception(clip, tell), index, steps, views, tell=tell)
+
+
+def _stages(index: int) -> int:
+    """Results that a forecast asks `Perception` for: six of each frame, and the picture before them."""
+    return 6 * min(index + 1, 2) + 1
+
+
+def forecast_frames(
+    perception: Perception,
+    index: int,
+    steps: int,
+    views: Sequence[View],
+    *,
+    future_from_cur: Sequence[NDArray[np.float64]] | None = None,
+    tell: Callable[[str], None] = lambda stage: None,
+) -> Forecast:
+    """`forecast_clip` on a `Perception` that may have seen earlier frames already, and keeps what it sees.
+
+    Args:
+        perception: of the clip.
+        index: the current frame t.
+        steps: frames to forecast.
+        views: cameras to show each from.
+        future_from_cur: [4, 4] m a step, the camera's true motion from t, in place of constant velocity.
+        tell: called with the stage before each view.
+
+    Raises:
+        ValueError: as `forecast_clip`.
+    """
+    clip = perception.clip
+    if not 1 <= index < len(clip):
+        raise ValueError(f"`index` must be 1 ... {len(clip) - 1}, a frame of {clip.name} with one before, got {index}")
+    if steps < 1 or not views:
+        raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
+    cameras = _extrapolate(perception, index, steps) if future_from_cur is None else list(future_from_cur)
+    clouds = _clouds(perception, index)
+    start, frames = time.perf_counter(), []
+    for step in range(1, steps + 1):
+        moved = [cloud(step, [np.eye(4), *cameras]) for cloud in clouds]
+        frames.append({})
+        for view in views:
+            tell("render")
+            frames[-1][view.name] = _render(moved, clip[index].K if view.K is None else view.K, view, clip)
+    seconds = perception.seconds | {"render": time.perf_counter() - start}
+    return Forecast(METHOD, cameras[:steps], frames, seconds)
+
+
+def _extrapolate(perception: Perception, index: int, steps: int) -> list[NDArray[np.float64]]:
+    """future_from_cur for each step."""
+    seen = range(max(index - _MOTIONS + 1, 1), index + 1)
+    motion = constant_velocity([np.linalg.inv(perception.prev_from_cur(i)) for i in seen])
+    return [np.linalg.matrix_power(motion, step) for step in range(1, steps + 1)]
+
+
+MovingCloud = Callable[[int, list[NDArray[np.float64]]], Cloud]
+"""A cloud at a step, given ``future_from_cur`` of all steps from 0."""
+
+
+def _clouds(perception: Perception, index: int) -> list[MovingCloud]:
+    """What the current frame shows; what was static in the one before; what is behind the current foreground."""
+    K = perception.clip[index].K
+    cur, prev = perception.seen(index), perception.seen(index - 1)
+    cur_from_prev = np.linalg.inv(perception.prev_from_cur(index))
+    everything = np.ones_like(cur.layers.mask)
+    shown = _cloud(cur.layers.image, cur.layers.depth, everything, K, _velocity_map(cur), cur.own)
+    stood = ~prev.own & ~_velocity_map(prev).any(0, keepdims=True)
+    before = _cloud(prev.layers.image, prev.layers.depth, stood, K, None, None, cur_from_prev)
+    hidden = ~cur.layers.mask & ~cur.own
+    behind = _cloud(cur.layers.background_image, cur.layers.background_depth, hidden, K)
+    return [shown, before, behind]
+
+
+def _velocity_map(seen: Seen) -> NDArray[np.float64]:
+    """[3, H, W] m a frame."""
+    return np.ascontiguousarray(seen.velocities[seen.things].transpose(2, 0, 1))
+
+
+def _cloud(
+    image: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    which: NDArray[np.bool_],
+    K: NDArray[np.float64],
+    velocity: NDArray[np.float64] | None = None,
+    own: NDArray[np.bool_] | None = None,
+    cur_from_src: NDArray[np.float64] | None = None,
+) -> MovingCloud:
+    """The pixels of ``which`` [1, H, W] as points of the current camera; those of the recording car ride along."""
+    y, x = np.nonzero(which[0])
+    z = depth[0, y, x].astype(np.float64)
+    points = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(K).T * z[:, None]
+    if cur_from_src is not None:
+        points = _transform(cur_from_src, points)
+    speed = np.zeros((1, 3)) if velocity is None else velocity[:, y, x].T
+    rides = np.zeros((len(x), 1), bool) if own is None else own[0, y, x][:, None]
+
+    def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
+        there, before = (
+            np.where(rides, points, _transform(future_from_cur[k], points + k * speed)) for k in (step, step - 1)
+        )
+        step_xyz = (there - before).astype(np.float32)
+        return Cloud(there.astype(np.float32), z.astype(np.float32), image[:, y, x].T, step_xyz, y, x)
+
+    return at
+
+
+def _transform(dst_from_src: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return points @ dst_from_src[:3, :3].T + dst_from_src[:3, 3]
+
+
+def _render(clouds: list[Cloud], K: NDArray[np.float64], view: View, clip: Clip) -> Rendered:
+    shown = show(clouds, K, view.tgt_from_next, clip[0].height, clip[0].width)
+    return rendered(shown, fill_holes(shown.planes[:3], shown.planes[3:4], holes(shown)))

@@ -1,0 +1,47 @@
+"""What nobody has seen: holes of a view, filled smoothly from what surrounds them, the far side first."""
+
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+#: Surroundings count by 1 / (1/z + that)^2, 1/m: what was hidden is likelier to go on behind a hole than what hid it.
+_FAR: Final = 0.01
+
+
+def fill_holes(
+    image: NDArray[np.float32], inverse_depth: NDArray[np.float32], hole: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Push and pull: a hole takes the weighted mean of the next coarser level, which is filled likewise.
+
+    Args:
+        image: [C, H, W]; what is in the holes does not matter.
+        inverse_depth: [1, H, W], 1/m.
+        hole: [1, H, W], True = to be filled.
+
+    Returns:
+        [C, H, W]; ``image`` outside the holes. All 0 if everything is a hole.
+
+    Source: Gortler et al., The Lumigraph, 1996 (push and pull); the preference for what is far is ours.
+    """
+    if not hole.any():
+        return image
+    weight = np.where(hole, np.float32(0), (inverse_depth + np.float32(_FAR)) ** -2 * np.float32(_FAR**2))[0]
+    planes = np.where(hole, np.float32(0), image).transpose(1, 2, 0)
+    filled = _pull(np.ascontiguousarray(planes), weight).transpose(2, 0, 1)
+    return np.where(hole, filled, image)
+
+
+def _pull(image: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[H, W, C] with every pixel of weight 0 filled."""
+    height, width = weight.shape
+    if min(height, width) < 2 or (weight > 0).all():
+        mean = (image * weight[..., None]).sum((0, 1)) / max(float(weight.sum()), 1e-20)
+        return np.where(weight[..., None] > 0, image, mean.astype(np.float32))
+    size = (-(-width // 2), -(-height // 2))
+    share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+    total = cv2.resize(image * weight[..., None], size, interpolation=cv2.INTER_AREA).reshape(*share.shape, -1)
+    mean = np.divide(total, share[..., None], out=np.zeros_like(total), where=share[..., None] > 0)
+    coarse = cv2.resize(_pull(mean, share), (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.where(weight[..., None] > 0, image, coarse.reshape(height, width, -1))

@@ -1,0 +1,156 @@
+"""How things move by themselves: regions of the foreground, and each one's velocity from flow and depth."""
+
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vestcl.scene.correspondence import Correspondence, sample
+from vestcl.scene.parallax import moved_pixels
+
+#: Neighbours whose depths differ by a larger factor belong to different things.
+_JUMP: Final = 0.08
+
+#: Regions of fewer pixels, as a share of the picture, are too small to measure and follow the camera alone.
+_SMALLEST: Final = 0.0003
+
+#: Forward-backward error beyond which flow is not believed, px.
+_FLOW_ERROR: Final = 1.0
+
+#: Error of flow, px; residuals beyond so many times of it count linearly (Huber).
+_FLOW_STD, _HUBER = 0.5, 2.0
+
+#: So many neighbouring pixels err alike, and count as one.
+_ALIKE: Final = 50.0
+
+#: What is expected of a velocity before anything is measured: metres a frame, each axis (20 m/s at 10 Hz).
+_SPEED_STD: Final = 2.0
+
+#: A thing is said to move if that explains its flow so much better: mean robust cost, in variances of flow.
+_GAIN: Final = 1.5
+
+#: Pixels of a thing that take part, evenly chosen: neighbours say the same.
+_PIXELS: Final = 3000
+
+#: Gauss-Newton rounds.
+_ROUNDS: Final = 6
+
+
+def segment(mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> NDArray[np.int32]:
+    """The foreground cut into things: connected, and with no jump of depth inside.
+
+    Args:
+        mask: [1, H, W], True = background.
+        depth: [1, H, W] m, above 0.
+
+    Returns:
+        [H, W]: 1 ... n by thing, 0 = background and things too small to measure.
+    """
+    foreground, log_depth = ~mask[0], np.log(depth[0])
+    jump = np.zeros_like(foreground)
+    jump[:, 1:] |= np.abs(np.diff(log_depth, axis=1)) > _JUMP
+    jump[1:] |= np.abs(np.diff(log_depth, axis=0)) > _JUMP
+    inner = (foreground & ~jump).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(inner, connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] >= _SMALLEST * foreground.size
+    large[0] = False
+    renumbered = np.where(large, np.cumsum(large), 0).astype(np.int32)
+    return _grown(renumbered[labels], foreground)
+
+
+def _grown(things: NDArray[np.int32], foreground: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Foreground that no thing owns goes to the nearest one."""
+    if not things.any():
+        return things
+    _, nearest = cv2.distanceTransformWithLabels(
+        (things == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    owner = np.zeros(nearest.max() + 1, np.int32)
+    owner[nearest[things > 0]] = things[things > 0]
+    return np.where(foreground, owner[nearest], 0)
+
+
+def velocities(
+    things: NDArray[np.int32],
+    depth: NDArray[np.float32],
+    depth_prev: NDArray[np.float32],
+    inverse_std: float,
+    correspondence: Correspondence,
+    prev_from_cur: NDArray[np.float64],
+    K: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """v_n [n + 1, 3] m a frame, in the camera's axes at t: thing n was at x - v_n, had the camera not moved.
+
+    min over v of the Huber costs of project(K (R (x - v) + t)) - p - flow(p), and of the inverse depth there against
+    what the frame before measured, plus |v|^2 / SPEED_STD^2. Row 0, and things that need no motion of their own to be
+    explained, are 0.
+
+    Args:
+        things: [H, W], from `segment`.
+        depth: [1, H, W] m at t; 0 = invalid.
+        depth_prev: [1, H, W] m at t - 1; 0 = invalid.
+        inverse_std: of 1 / depth, 1/m.
+        correspondence: from t to t - 1.
+        prev_from_cur: [4, 4] m, the camera's motion.
+        K: [3, 3] px.
+
+    Source: SPEC section 8.
+    """
+    result = np.zeros((int(things.max()) + 1, 3))
+    moved = moved_pixels(correspondence.flow_uv)
+    before = np.divide(1, depth_prev, out=np.zeros_like(depth_prev), where=depth_prev > 0)
+    inverse_prev = sample(before, moved[0] - 0.5, moved[1] - 0.5)[0]
+    believed = (things > 0) & (depth[0] > 0) & (correspondence.error[0] < _FLOW_ERROR)
+    for thing in range(1, len(result)):
+        here = believed & (things == thing)
+        if here.sum() < _SMALLEST / 2 * things.size:
+            continue
+        y, x = (indices[:: -(-len(indices) // _PIXELS)] for indices in np.nonzero(here))
+        rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(K).T
+        points = rays * depth[0, y, x, None]
+        measured = np.column_stack([moved[:, y, x].T, inverse_prev[y, x]])
+        result[thing] = _velocity(points, measured, inverse_std, prev_from_cur, K)
+    return result
+
+
+def _velocity(
+    points: NDArray[np.float64], measured: NDArray[np.float64], inverse_std: float, prev_from_cur: NDArray[np.float64],
+    K: NDArray[np.float64],
+) -> NDArray[np.float64]:  # fmt: skip
+    """One thing's v [3], or 0 if that explains as much. ``measured`` [N, 3]: px, px, 1/m."""
+    known = np.column_stack([np.ones((len(points), 2), bool), measured[:, 2] > 0])
+    spread = np.array([_FLOW_STD, _FLOW_STD, 2 * inverse_std])
+    v, cost = np.zeros(3), []
+    for _ in range(_ROUNDS):
+        predicted, jacobian = _predict(points, v, prev_from_cur, K)
+        residual = np.where(known, (measured - predicted) / spread, 0)
+        weight = known * np.minimum(1, _HUBER / np.maximum(np.abs(residual), 1e-9)) / _ALIKE
+        scaled = jacobian / spread[:, None]
+        normal = np.einsum("nij,ni,nik->jk", scaled, weight, scaled) + np.eye(3) / _SPEED_STD**2
+        right = np.einsum("nij,ni,ni->j", scaled, weight, residual) - v / _SPEED_STD**2
+        v = v + np.linalg.solve(normal, right)
+        cost.append(_cost(residual))
+    predicted, _ = _predict(points, v, prev_from_cur, K)
+    gain = cost[0] - _cost(np.where(known, (measured - predicted) / spread, 0))
+    return v if gain > _GAIN else np.zeros(3)
+
+
+def _cost(residual: NDArray[np.float64]) -> float:
+    """Mean over points of the sum of Huber costs."""
+    size = np.abs(residual)
+    return float(np.where(size < _HUBER, size**2 / 2, _HUBER * (size - _HUBER / 2)).sum(1).mean())
+
+
+def _predict(
+    points: NDArray[np.float64], v: NDArray[np.float64], prev_from_cur: NDArray[np.float64], K: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(u, v, 1/z) [N, 3] in the frame before, and its derivative by v [N, 3, 3]."""
+    turn, shift = prev_from_cur[:3, :3], prev_from_cur[:3, 3]
+    x, y, z = ((points - v) @ turn.T + shift).T
+    z = np.maximum(z, 0.1)
+    u, w = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+    zero = np.zeros_like(z)
+    rows = [[K[0, 0] / z, zero, -K[0, 0] * x / z**2], [zero, K[1, 1] / z, -K[1, 1] * y / z**2], [zero, zero, -1 / z**2]]
+    by_position = np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    return np.stack([u, w, 1 / z], axis=1), -by_position @ turn

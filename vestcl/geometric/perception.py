@@ -1,0 +1,158 @@
+"""What can be known of a clip's frames without a network: depth, own motion, masks, layers, things. Kept by frame."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vestcl.data.sample import Clip
+from vestcl.geometric import objects
+from vestcl.io.labels import SKY, background
+from vestcl.scene.correspondence import Correspondence, correspond
+from vestcl.scene.ego_motion import ego_motion
+from vestcl.scene.layers import Layers, build_layers
+from vestcl.scene.lidar import densify
+from vestcl.scene.motion_mask import motion_mask
+from vestcl.scene.parallax import View, refine_depth
+from vestcl.scene.sky import sky_mask
+from vestcl.scene.stereo import stereo_depth
+
+#: Standard deviation of a stereo pair's disparity, px, and the nearest depth that is searched for, m.
+_DISPARITY_STD, _NEAREST = 0.35, 2.0
+
+#: Standard deviation of any other depth's inverse, 1/m: 2 % at 10 m.
+_INVERSE_STD: Final = 0.002
+
+#: Depth maps with a smaller share of valid pixels are scans, to be densified.
+_DENSE: Final = 0.3
+
+#: Results of so many frames before the last one asked for are kept; a forecast looks at three.
+_KEPT: Final = 4
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One frame, understood."""
+
+    layers: Layers
+    things: NDArray[np.int32]
+    """[H, W], 0 = background, else the thing."""
+    velocities: NDArray[np.float64]
+    """[n + 1, 3] m a frame, by thing, in the camera's axes."""
+    own: NDArray[np.bool_]
+    """[1, H, W], True where the recording car itself is in the picture."""
+
+
+class Perception:
+    """Results for the frames of a clip: computed when asked for, kept while later frames need them.
+
+    ``seconds`` tells the time by stage. Depth comes from the clip (scans are densified), else from its stereo pair,
+    else from motion; masks from labels, else from motion.
+    """
+
+    def __init__(self, clip: Clip, progress: Callable[[str], None] | None = None) -> None:
+        self.clip = clip
+        self.seconds: dict[str, float] = {}
+        self._progress = progress
+        self._kept: dict[tuple[str, int], Any] = {}
+        self._inner = 0.0
+
+    def image(self, index: int) -> NDArray[np.float32]:
+        """[3, H, W]."""
+        return self._once("read", index, lambda: self.clip[index].read_image())
+
+    def correspondence(self, index: int) -> Correspondence:
+        """From frame ``index`` to the one before."""
+        return self._once("flow", index, lambda: correspond(self.image(index), self.image(index - 1)))
+
+    def raw_depth(self, index: int) -> NDArray[np.float32]:
+        """[1, H, W] m as it was measured, 0 = invalid."""
+        return self._once("depth", index, lambda: self._depth(index))
+
+    def prev_from_cur(self, index: int) -> NDArray[np.float64]:
+        """[4, 4] m: the camera's motion from frame ``index`` to the one before."""
+        return self._once("ego-motion", index, lambda: self._ego_motion(index))
+
+    def mask(self, index: int) -> NDArray[np.bool_]:
+        """M [1, H, W], True = static background."""
+        return self._once("mask", index, lambda: self._mask(index))
+
+    def seen(self, index: int) -> Seen:
+        """The frame's layers and things."""
+        return self._once("layers", index, lambda: self._see(index))
+
+    def inverse_std(self, index: int) -> float:
+        """Standard deviation of 1 / depth, 1/m."""
+        sample = self.clip[index]
+        if sample.depth is not None or sample.right is None:
+            return _INVERSE_STD
+        return _DISPARITY_STD / -float(sample.K[0, 0] * sample.right.right_from_left[0, 3])
+
+    def _once(self, stage: str, index: int, compute: Callable[[], Result]) -> Result:
+        key = (stage, index)
+        if key not in self._kept:
+            if self._progress:
+                self._progress(stage)
+            outer, self._inner, start = self._inner, 0.0, time.perf_counter()
+            self._kept[key] = compute()
+            taken = time.perf_counter() - start
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + taken - self._inner
+            self._inner = outer + taken
+            for old in [kept for kept in self._kept if not index - _KEPT < kept[1] <= index + _KEPT]:
+                del self._kept[old]
+        return self._kept[key]
+
+    def _depth(self, index: int) -> NDArray[np.float32]:
+        sample = self.clip[index]
+        if sample.depth is not None:
+            depth = sample.read_depth()
+            return depth if (depth > 0).mean() >= _DENSE else densify(depth, self.image(index), sky=self._sky(index))
+        if sample.right is None:
+            raise ValueError(f"{self.clip.name}: has neither depth nor a right camera")
+        focal = -float(sample.K[0, 0] * sample.right.right_from_left[0, 3])
+        searched = min(math.ceil(focal / _NEAREST), sample.width // 2)
+        pair = self.image(index), sample.right.read_image()
+        rig = sample.right.right_from_left
+        return stereo_depth(*pair, sample.K, rig, max_disparity=searched, fill=False)
+
+    def _ego_motion(self, index: int) -> NDArray[np.float64]:
+        sample = self.clip[index]
+        static = ~sample.read_ego_vehicle()
+        if sample.labels is not None:
+            static &= sample.read_mask()
+        found = ego_motion(self.raw_depth(index), static, self.correspondence(index), sample.K)
+        return found.dst_from_src
+
+    def _mask(self, index: int) -> NDArray[np.bool_]:
+        sample = self.clip[index]
+        if sample.labels is not None:
+            return background(sample.read_labels())
+        if index == 0:
+            return np.ones((1, sample.height, sample.width), bool)
+        mask = motion_mask(self.raw_depth(index), self.correspondence(index), self.prev_from_cur(index), sample.K)
+        return mask | sample.read_ego_vehicle()
+
+    def _sky(self, index: int, depth: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:
+        sample = self.clip[index]
+        return sample.read_labels() == SKY if sample.labels is not None else sky_mask(self.image(index), depth)
+
+    def _see(self, index: int) -> Seen:
+        sample, mask, depth = self.clip[index], self.mask(index), self.raw_depth(index)
+        own = sample.read_ego_vehicle()
+        if index > 0:
+            view = View(self.correspondence(index), self.prev_from_cur(index))
+            depth = refine_depth(depth, self.inverse_std(index), sample.K, [view], mask & ~own)
+        layers = build_layers(self.image(index), depth, mask, sky=self._sky(index, depth))
+        things = objects.segment(mask, layers.depth)
+        velocities = np.zeros((int(things.max()) + 1, 3))
+        if index > 0:
+            measured = self.raw_depth(index), self.raw_depth(index - 1), self.inverse_std(index)
+            motion = self.correspondence(index), self.prev_from_cur(index)
+            velocities = objects.velocities(things, *measured, *motion, sample.K)
+        return Seen(layers, things, velocities, own)

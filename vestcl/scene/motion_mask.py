@@ -1,0 +1,75 @@
+"""Background masks with no weights at all: whatever moves in a way that the camera's own motion can't explain."""
+
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vestcl.scene import _check
+from vestcl.scene.correspondence import Correspondence
+from vestcl.scene.parallax import moved_pixels
+
+#: Forward-backward error beyond which flow is not believed, px.
+_FLOW_ERROR: Final = 1.0
+
+#: Flow that is off by more pixels than that, plus a share of the rigid flow, shows motion of its own. Depth errors of
+#: a static scene stay below on KITTI.
+_MOVES, _MOVES_SHARE = 2.0, 0.15
+
+#: Holes and specks up to that share of the picture's width are closed and dropped, and so are regions of less than
+#: that share of its pixels: a pedestrian at 25 m has 0.1 %.
+_BRUSH, _SMALLEST = 0.006, 0.0008
+
+
+def motion_mask(
+    depth: ArrayLike, correspondence: Correspondence, dst_from_src: ArrayLike, K: ArrayLike
+) -> NDArray[np.bool_]:
+    """M: False where |p + flow(p) - project(K (R x + t))| exceeds what errors of depth explain, over whole regions.
+
+    Args:
+        depth: [1, H, W] m; 0 = invalid, of which nothing is said: such pixels count as background.
+        correspondence: from that frame to another one.
+        dst_from_src: [4, 4] m, the camera's motion between them.
+        K: [3, 3] px.
+
+    Returns:
+        [1, H, W], True = static background.
+
+    Raises:
+        ValueError: shapes or numbers that aren't finite.
+
+    Source: SPEC section 8.
+    """
+    depth = _check.depth("depth", depth)
+    dst_from_src = _check.matrix("dst_from_src", dst_from_src, 4)
+    rigid = rigid_pixels(depth, _check.matrix("K", K, 3), dst_from_src)
+    still = np.hypot(*(rigid - moved_pixels(np.zeros_like(correspondence.flow_uv))))
+    off = np.hypot(*(moved_pixels(correspondence.flow_uv) - rigid))
+    believed = (depth[0] > 0) & (correspondence.error[0] < _FLOW_ERROR)
+    moves = believed & (off > _MOVES + _MOVES_SHARE * still)
+    return ~_regions(moves)[None]
+
+
+def rigid_pixels(
+    depth: NDArray[np.float32], K: NDArray[np.float64], dst_from_src: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Where a static scene of ``depth`` [1, H, W] is seen from dst: [2, H, W] px; invalid depth counts as infinite."""
+    pixels = moved_pixels(np.zeros((2, *depth.shape[1:]), np.float32))
+    homogeneous = np.concatenate([pixels, np.ones_like(pixels[:1])])
+    inverse = np.divide(1, depth[0], out=np.zeros_like(depth[0]), where=depth[0] > 0)
+    turned = np.tensordot(K @ dst_from_src[:3, :3] @ np.linalg.inv(K), homogeneous, 1)
+    q = turned + inverse * (K @ dst_from_src[:3, 3])[:, None, None]
+    return q[:2] / np.maximum(q[2], 1e-6)
+
+
+def _regions(moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """``moves`` [H, W] without specks, its holes closed."""
+    side = max(3, 2 * round(_BRUSH * moves.shape[1] / 2) + 1)
+    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    opened = cv2.morphologyEx(moves.astype(np.uint8), cv2.MORPH_OPEN, brush)
+    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, brush, iterations=2)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= _SMALLEST * moves.size
+    large[0] = False
+    return large[labels]
