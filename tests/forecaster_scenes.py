@@ -1,0 +1,125 @@
+"""Small networks, frames and cameras that the forecaster is tested on."""
+
+import dataclasses
+from typing import Any
+
+import torch
+from torch import nn
+
+from vestcl.models import EgoMotion, ModelConfig, ObjectMotion
+from vestcl.models._render import Side
+from vestcl.models.config import (
+    FIXED_DEPTH,
+    EgoMotionConfig,
+    EncoderConfig,
+    ObjectMotionConfig,
+    RefineConfig,
+    RenderConfig,
+    RoutingConfig,
+)  # fmt: skip
+from vestcl.models.forecaster import Forecaster, Step
+from vestcl.scene.layers import LayerBatch
+
+OBJECTS = ObjectMotionConfig("dmvfn", scales=(2, 1), widths=(8, 8), detail=4)
+
+TINY = ModelConfig(
+    "tiny",
+    encoder=EncoderConfig(widths=(8, 8, 8), blocks=(1, 1, 1), decoder=(8, 8), features=4),
+    ego_motion=EgoMotionConfig(widths=(8, 8, 8, 8), blocks=1, heads=2),
+    object_motion=OBJECTS,
+    refine=RefineConfig(stem=4, stem_kernel=3, widths=(4, 8)),
+)
+
+#: Focal length of the test camera, px.
+FOCAL = 30.0
+
+
+def change(**fields: Any) -> ModelConfig:
+    return dataclasses.replace(TINY, **fields)
+
+
+#: Every colour shown by its own pixel alone: at rest nothing blurs.
+SHARP = change(render=RenderConfig(rho=0.95))
+
+ABLATIONS = {
+    "whole": TINY,
+    "fixed depth": change(fixed_depth=FIXED_DEPTH),
+    "no ego-motion": change(ego_motion=None),
+    "no object motion": change(object_motion=None),
+    "no motion": change(ego_motion=None, object_motion=None),
+    "features only": change(render=RenderConfig(colour=False)),
+    "joint": change(render=RenderConfig(joint=True)),
+    "joint features": change(render=RenderConfig(joint=True, colour=False)),
+    "residual": change(refine=dataclasses.replace(TINY.refine, residual=True)),
+    "routing": change(object_motion=dataclasses.replace(OBJECTS, routing=RoutingConfig(4, budget=1.0))),
+    "paper": change(object_motion=dataclasses.replace(OBJECTS, shape="paper")),
+}
+
+
+def frame(batch: int, height: int, width: int, foreground: bool = True) -> LayerBatch:
+    """Random frames; with foreground, image b has a block of b + 2 rows of it, 4 columns wide."""
+    image, depth = torch.rand(batch, 3, height, width), torch.rand(batch, 1, height, width) * 20 + 5
+    mask = torch.ones_like(depth)
+    if foreground:
+        for b in range(batch):
+            mask[b, :, 6 : 8 + b, 8:12] = 0
+    return LayerBatch(image, depth, mask, image * mask, depth + 10 * (1 - mask))
+
+
+def pair_of(batch: int, height: int, width: int, foreground: bool = True) -> tuple[LayerBatch, LayerBatch]:
+    return frame(batch, height, width, foreground), frame(batch, height, width, foreground)
+
+
+def wall(height: int, width: int, depth: float) -> LayerBatch:
+    """A random picture on a wall that faces the camera."""
+    image, metres = torch.rand(1, 3, height, width), torch.full((1, 1, height, width), depth)
+    return LayerBatch(image, metres, torch.ones_like(metres), image, metres)
+
+
+def camera(batch: int, height: int, width: int) -> torch.Tensor:
+    return torch.tensor([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1]]).repeat(batch, 1, 1)
+
+
+def drive(model: Forecaster, prev: tuple[float, ...], cur: tuple[float, ...]) -> Forecaster:
+    """Let the model forecast these translations, metres, whatever it sees."""
+    assert isinstance(model.ego_motion, EgoMotion)
+    rest = (1.0, 0.0, 0.0, 0.0)
+    with torch.no_grad():
+        model.ego_motion.motion.bias.copy_(torch.tensor([*rest, *prev, *rest, *cur]))
+    return model
+
+
+def stir(model: Forecaster) -> Forecaster:
+    """Last layers that start at zero no longer do: a small motion, other for each object."""
+    assert isinstance(model.ego_motion, EgoMotion) and isinstance(model.object_motion, ObjectMotion)
+    nn.init.normal_(model.ego_motion.motion.weight, std=0.01)
+    for block in model.object_motion.blocks:
+        for parameter in block.get_submodule("out").parameters():
+            nn.init.normal_(parameter, std=0.01)
+    return model
+
+
+def push(model: Forecaster, *displacement: float) -> Forecaster:
+    """Let the objects' forecast add that displacement, metres, previous frame's xyz and then the current one's."""
+    assert isinstance(model.object_motion, ObjectMotion)
+    with torch.no_grad():
+        model.object_motion.blocks[-1].get_parameter("out.bias").copy_(torch.tensor(displacement))
+    return model
+
+
+def sides_of(model: Forecaster, *arguments: Any) -> tuple[Step, list[Side]]:
+    """The step, and what its clouds left on the view."""
+    caught: list[list[Side]] = []
+    original = model.splat
+
+    def splat(*splatted: Any) -> list[Side]:
+        caught.append(original(*splatted))
+        return caught[-1]
+
+    model.splat = splat  # type: ignore[assignment, method-assign]
+    return model(*arguments), caught[0]
+
+
+def plain(image: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor) -> LayerBatch:
+    """Layers without inpainting."""
+    return LayerBatch(image, torch.where(depth > 0, depth, 10.0), mask, image, torch.where(depth > 0, depth, 10.0))

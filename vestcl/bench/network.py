@@ -1,0 +1,278 @@
+"""`vestcl bench network`: one forecast stage by stage, one training step, and the memory that they take."""
+
+import contextlib
+import dataclasses
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from torch import nn
+
+from vestcl import runtime
+from vestcl.bench import _timing
+from vestcl.bench._timing import Spread
+from vestcl.bench.splat import WIDTH, describe, write_json
+from vestcl.data import Frame, Street, intrinsics
+from vestcl.data.raycast import SKY_DEPTH
+from vestcl.io.labels import background
+from vestcl.models import ModelConfig, configuration
+from vestcl.models.forecaster import Forecaster, Step
+from vestcl.scene import layers
+from vestcl.scene.layers import LayerBatch
+
+#: Seconds from frame to frame: KITTI's cameras give ten a second.
+INTERVAL: Final = 0.1
+
+#: (model, height, width) -> seconds that a forecast and a training step may take on two cores, and GB of memory.
+TARGETS: Final[dict[tuple[str, int, int], dict[str, float]]] = {
+    ("vest-s", 256, 832): {"forward": 2.0, "training step": 8.0},
+    ("vest-paper", 256, 832): {"memory": 24.0},
+}
+
+#: Runs before anything counts: they compile the kernels and fill the memory pools.
+WARM_UP: Final = 1
+
+#: Of Adam (SPEC section 7).
+LEARNING_RATE: Final = 1e-4
+
+
+@dataclass(frozen=True)
+class NetworkBench:
+    """Time the network on two frames of a street, with true depth and labels."""
+
+    model: str = "vest-s"
+    """A configuration: "vest-paper", "vest-s+joint", ..."""
+    height: int = 256
+    """Pixels."""
+    width: int = 832
+    """Pixels."""
+    runs: int = 5
+    """Of the forecast, and of the training step."""
+    training: bool = True
+    """Also one training step of batch 1."""
+    seed: int = 0
+    """Of the street and the weights."""
+    threads: int = 2
+    """Of torch."""
+    device: str | None = None
+    """OpenCL device: an index of `vestcl devices` or a part of its name."""
+    json: Path | None = None
+    """File for the results."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """One part of the work, in seconds a run: wall time, and the CPU time of all threads."""
+
+    name: str
+    wall: Spread
+    cpu: Spread
+
+
+@dataclass(frozen=True)
+class Part:
+    """A forecast or a training step, its stages first and the whole last."""
+
+    title: str
+    timings: list[Timing]
+    peak_gigabytes: float
+    """The most memory that the process has taken so far."""
+    others_cores: float | None
+    """That other processes kept busy meanwhile."""
+
+
+@dataclass
+class Stopwatch:
+    """Seconds of named stages, summed up over one run."""
+
+    wall: dict[str, float] = field(default_factory=dict)
+    cpu: dict[str, float] = field(default_factory=dict)
+
+    @contextlib.contextmanager
+    def time(self, name: str) -> Iterator[None]:
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        self.wall[name] = self.wall.get(name, 0.0) + time.perf_counter() - wall
+        self.cpu[name] = self.cpu.get(name, 0.0) + time.process_time() - cpu
+
+
+class TimedForecaster(Forecaster):
+    """A `Forecaster` that tells its stages' times."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__(config)
+        self.watch = Stopwatch()
+
+    def encode(self, *arguments: Any) -> Any:
+        with self.watch.time("encode"):
+            return super().encode(*arguments)
+
+    def move_camera(self, *arguments: Any) -> Any:
+        with self.watch.time("camera motion (EMF)"):
+            return super().move_camera(*arguments)
+
+    def move_objects(self, *arguments: Any) -> Any:
+        with self.watch.time("object motion (OMF)"):
+            return super().move_objects(*arguments)
+
+    def lift(self, *arguments: Any) -> Any:
+        with self.watch.time("lift"):
+            return super().lift(*arguments)
+
+    def splat(self, *arguments: Any) -> Any:
+        with self.watch.time("displace and splat"):
+            return super().splat(*arguments)
+
+    def paint(self, *arguments: Any) -> Any:
+        with self.watch.time("refine"):
+            return super().paint(*arguments)
+
+
+def main(config: NetworkBench) -> None:
+    """Measure, print and write.
+
+    Raises:
+        ValueError: a size or number that is not positive, or a model that isn't known.
+        DeviceError: no such device.
+    """
+    for name in ("height", "width", "runs", "threads"):
+        if getattr(config, name) <= 0:
+            raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
+    model_config = configuration(config.model)
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    with runtime.use(config.device) as session, _timing.torch_threads(config.threads):
+        machine = describe(session)
+        for name, value in machine.items():
+            console.print(f"{name}: {value}", soft_wrap=True, highlight=False)
+        torch.manual_seed(config.seed)
+        model = TimedForecaster(model_config)
+        frames, K = street_frames(config.height, config.width, config.seed)
+        parts = list(_parts(config, console, model, frames, torch.from_numpy(K)[None].float()))
+    if config.json is not None:
+        settings = dataclasses.asdict(config) | {"json": str(config.json)}
+        results = {"machine": machine, "config": settings, "parts": [dataclasses.asdict(part) for part in parts]}
+        write_json(config.json, results)
+        console.print(f"wrote {config.json}", soft_wrap=True)
+
+
+def street_frames(height: int, width: int, seed: int, count: int = 3) -> tuple[list[Frame], np.ndarray]:
+    """Frames at t - 1, t, t + 1, ... of a street, and K [3, 3] px."""
+    street, K = Street.generate(seed), intrinsics(height, width)
+    times = [index * INTERVAL for index in range(count)]
+    poses = (np.linalg.inv(street.camera_pose(t)) for t in times)
+    return [street.render(pose, K, height, width, t) for pose, t in zip(poses, times, strict=True)], K
+
+
+def street_layers(frame: Frame) -> LayerBatch:
+    """Layers [1, ...] of a street's frame, from its true depth and labels."""
+    sky = frame.depth[0] >= SKY_DEPTH
+    return layers.batch([layers.build_layers(frame.colour[0], frame.depth[0], background(frame.labels[0]), sky=sky)])
+
+
+def _parts(
+    config: NetworkBench, console: Console, model: TimedForecaster, frames: Sequence[Frame], K: torch.Tensor
+) -> Iterator[Part]:
+    """Measure and print part after part. Memory only grows, so the training step comes last."""
+
+    def forecast() -> Step:
+        with model.watch.time("inpaint"):
+            pair = [street_layers(frame) for frame in frames[:2]]
+        with torch.no_grad(), model.watch.time("forward"):
+            return model(*pair, K)
+
+    model.eval()
+    yield _show(config, console, _measure(f"{config.model}, forecast", model, forecast, "forward", config.runs))
+    if config.training:
+        pair, truth = [street_layers(frame) for frame in frames[:2]], torch.from_numpy(frames[2].colour)
+        adam = torch.optim.Adam(model.train().parameters(), LEARNING_RATE)
+
+        def train() -> None:
+            with model.watch.time("training step"):
+                train_once(model, adam, pair, truth, K)
+
+        yield _show(config, console, _measure(f"{config.model}, training", model, train, "training step", config.runs))
+
+
+def train_once(
+    model: TimedForecaster,
+    adam: torch.optim.Optimizer,
+    pair: Sequence[LayerBatch],
+    truth: torch.Tensor,
+    K: torch.Tensor,
+) -> float:
+    """One step down the L1 loss; the loss."""
+    adam.zero_grad(set_to_none=True)
+    with model.watch.time("all of forward"):
+        loss = nn.functional.l1_loss(model(*pair, K).views[0].image, truth)
+    with model.watch.time("backward"):
+        loss.backward()
+    with model.watch.time("Adam"):
+        adam.step()
+    return loss.item()
+
+
+def _measure(title: str, model: TimedForecaster, task: Callable[[], object], whole: str, runs: int) -> Part:
+    for _ in range(WARM_UP):
+        task()
+    watches = []
+    with _timing.watching_others() as others:
+        for _ in range(runs):
+            model.watch = Stopwatch()
+            task()
+            watches.append(model.watch)
+    names = sorted(watches[0].wall, key=lambda name: name == whole)
+    timings = [
+        Timing(
+            name, *(Spread.of(np.array([getattr(watch, kind)[name] for watch in watches])) for kind in ("wall", "cpu"))
+        )
+        for name in names
+    ]
+    return Part(title, timings, peak_gigabytes(), others.cores)
+
+
+def peak_gigabytes() -> float:
+    """The most memory that the process has had resident, GB."""
+    units = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * units / 1e9
+
+
+def _show(config: NetworkBench, console: Console, part: Part) -> Part:
+    """Print ``part`` beside its targets, and hand it on."""
+    targets = TARGETS.get((config.model, config.height, config.width), {})
+    title = f"{part.title}, {config.height}x{config.width}, {config.threads} threads"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
+    for column in ("", "ms (quartiles)", "CPU ms", "target"):
+        table.add_column(column, justify="right" if column else "left")
+    for timing in part.timings:
+        target = targets.get(timing.name)
+        verdict = "" if target is None else f"<= {target * 1e3:.0f} {_verdict(timing.wall.median <= target, part)}"
+        table.add_row(timing.name, _ms(timing.wall), f"{timing.cpu.median * 1e3:.0f}", verdict)
+    memory = targets.get("memory")
+    verdict = "" if memory is None else f"<= {memory:g} {_verdict(part.peak_gigabytes <= memory)}"
+    table.add_row("peak memory, GB", f"{part.peak_gigabytes:.2f}", "", verdict)
+    if not _timing.is_quiet(part.others_cores):
+        table.caption = f"other processes kept {part.others_cores:.1f} cores busy meanwhile: measure again"
+        table.caption_style, table.caption_justify = "red", "left"
+    console.print(table)
+    return part
+
+
+def _ms(spread: Spread) -> str:
+    return f"{spread.median * 1e3:.0f} ({spread.low * 1e3:.0f}-{spread.high * 1e3:.0f})"
+
+
+def _verdict(reached: bool, timed: Part | None = None) -> str:
+    """A time that is too long on a machine with other work proves nothing."""
+    if reached:
+        return "[green]reached[/]"
+    disturbed = timed is not None and not _timing.is_quiet(timed.others_cores)
+    return "[yellow]can't tell[/]" if disturbed else "[red]missed[/]"

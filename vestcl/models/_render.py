@@ -1,0 +1,138 @@
+"""What a camera sees of the clouds: a splat of each, and what follows from both."""
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import torch
+
+from vestcl import constants
+from vestcl.models._clouds import Cloud, last_motion
+from vestcl.models._layers import check
+from vestcl.ops.displace import displace
+from vestcl.ops.splat import composite, rasterize
+
+#: Limits of a footprint's radius, px: half the splatter's tile, and where a footprint can miss every pixel centre.
+RADIUS: Final = (0.5, constants.TILE / 2)
+
+#: A pixel that is covered by less has no depth of its own: one footprint's outermost tenth alone is on it.
+LEAST_COVERAGE: Final = 0.1
+
+
+class Camera(NamedTuple):
+    """Where a view is taken from."""
+
+    tgt_from_next: torch.Tensor
+    """[B, 4, 4] m: from the source camera at the forecast time."""
+    K: torch.Tensor
+    """[B, 3, 3] px."""
+
+
+class Side(NamedTuple):
+    """What one cloud leaves on a view. All but coverage are multiplied by it."""
+
+    features: torch.Tensor
+    """[B, C, H, W]."""
+    colour: torch.Tensor
+    """[B, 3, H, W]."""
+    coverage: torch.Tensor
+    """[B, 1, H, W]."""
+    inverse_depth: torch.Tensor
+    """[B, 1, H, W] 1/m, in the view's camera."""
+    background: torch.Tensor
+    """[B, 1, H, W], the share of static background; no gradient."""
+    inverse_motion: torch.Tensor
+    """[B, 3, H, W], (x_(t+k) - x_(t+k-1)) / z_tgt: else the sky, which turns by hundreds of metres, would outvote all
+    that it shines through; no gradient."""
+
+
+class RenderedView(NamedTuple):
+    """A future frame in one camera. Where both clouds are, the current frame's is in front."""
+
+    image: torch.Tensor
+    """[B, 3, H, W], refined."""
+    colour: torch.Tensor
+    """[B, 3, H, W], as splatted: times coverage."""
+    coverage: torch.Tensor
+    """[B, 1, H, W] in [0, 1]."""
+    depth: torch.Tensor
+    """[B, 1, H, W] m, the harmonic mean of what covers the pixel; 0 where that is less than LEAST_COVERAGE."""
+    background: torch.Tensor
+    """[B, 1, H, W], the share of static background in what covers the pixel; 1 where nothing does. No gradient."""
+    motion_xyz: torch.Tensor
+    """[B, 3, H, W] m, x_(t+k) - x_(t+k-1) of what the pixel shows, each in its own time's source camera, weighted by
+    1 / z as the depth is; 0 where unknown. No gradient."""
+
+
+def checked_camera(camera: tuple[torch.Tensor, torch.Tensor], batch: int) -> Camera:
+    """``camera`` with its names, for ``batch`` images.
+
+    Raises:
+        ValueError: another shape.
+    """
+    tgt_from_next, K = camera
+    check(tgt_from_next=(tgt_from_next, f"{batch} 4 4"), K=(K, f"{batch} 3 3"))
+    return Camera(tgt_from_next, K)
+
+
+def splat_cloud(
+    cloud: Cloud, camera: Camera, K: torch.Tensor, next_from_cur: torch.Tensor, rho: float, height: int, width: int
+) -> Side:
+    """Show a cloud in ``camera``: opaque points of radius r = rho z_src / z_tgt f_tgt / f_src, clamped to RADIUS.
+
+    Args:
+        cloud: of B images.
+        camera: B of them.
+        K: [B, 3, 3] px, of the camera that the cloud was seen by.
+        next_from_cur: [B, 4, 4] m, the camera's last motion, for ``motion_xyz``.
+        rho: radius in source pixels.
+        height: rows of the view.
+        width: columns of the view.
+
+    Returns:
+        What is seen; differentiable in the cloud, through positions, radii and inverse depth.
+    """
+    points_uv, z = _project(cloud, camera)
+    near = z.clamp(min=constants.NEAR)
+    zoom = (camera.K[:, 0, 0] * camera.K[:, 1, 1] / (K[:, 0, 0] * K[:, 1, 1])).sqrt()
+    zoom_of_point = zoom.repeat_interleave(cloud.starts.diff())
+    radii = (rho * zoom_of_point * cloud.depth / near).clamp(*RADIUS)
+    raster = rasterize(points_uv, z.detach(), radii, torch.ones_like(z), height, width, cloud_starts=cloud.starts)
+    image, coverage = composite(raster, torch.cat([cloud.shown, near.reciprocal()[:, None]], dim=1))
+    features, colour, inverse_depth = image.split([image.shape[1] - 4, 3, 1], dim=1)
+    with torch.no_grad():
+        known = torch.cat([cloud.background, last_motion(cloud, next_from_cur) / near[:, None]], dim=1)
+        background, inverse_motion = composite(raster, known)[0].split([1, 3], dim=1)
+    return Side(features, colour, coverage, inverse_depth, background, inverse_motion)
+
+
+def compose_view(sides: Sequence[Side], image: torch.Tensor) -> RenderedView:
+    """front + (1 - coverage) behind, the last side in front, and what follows from it.
+
+    Args:
+        sides: what each cloud left on the view, the current frame's last.
+        image: [B, 3, H, W], refined.
+
+    Returns:
+        The view; differentiable in colour, coverage, depth and image.
+    """
+    behind, *fronts = (torch.cat(side[1:], dim=1) for side in sides)
+    for front in fronts:
+        behind = front + (1 - front[:, 3:4]) * behind
+    colour, coverage, inverse_depth, background, inverse_motion = behind.split([3, 1, 1, 1, 3], dim=1)
+    known = coverage >= LEAST_COVERAGE
+    inverse_depth = torch.where(known, inverse_depth, 1)
+    depth = torch.where(known, coverage, 0) / inverse_depth
+    background = torch.where(known, background / coverage.detach().clamp(min=LEAST_COVERAGE), 1).detach()
+    motion_xyz = torch.where(known, inverse_motion / inverse_depth, 0).detach()
+    return RenderedView(image, colour, coverage, depth, background, motion_xyz)
+
+
+def _project(cloud: Cloud, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """points_uv [P, 2] px and z [P] m in each image's own camera."""
+    clouds = zip(cloud.points_xyz.split(cloud.sizes), cloud.displacement_xyz.split(cloud.sizes), strict=True)
+    cameras = zip(camera.K[:, None], camera.tgt_from_next[:, None], strict=True)
+    projected = [
+        displace(points[None], displacement[None], K, tgt_from_next)
+        for (points, displacement), (K, tgt_from_next) in zip(clouds, cameras, strict=True)
+    ]
+    return torch.cat([uv[0] for uv, _ in projected]), torch.cat([z[0] for _, z in projected])

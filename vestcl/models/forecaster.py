@@ -1,0 +1,298 @@
+"""The whole network: two frames in, future frames out, from any camera."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, Literal, NamedTuple
+
+import torch
+from torch import nn
+
+from vestcl import geometry
+from vestcl.models._checkpoint import read_checkpoint, write_checkpoint
+from vestcl.models._clouds import Cloud, advance, join, lift
+from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame, check_frames, grid_depth, grid_mean, with_depth
+from vestcl.models._perceive import Perceive, perceive_forecast, perceive_view, straight_view
+from vestcl.models._render import Camera, RenderedView, Side, checked_camera, compose_view, splat_cloud
+from vestcl.models.config import LOG_DEPTH_FAR, ModelConfig
+from vestcl.models.ego_motion import EgoMotion, RigidMotion
+from vestcl.models.encoder import Encoder, upsample_features
+from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
+from vestcl.models.refine import Refine
+from vestcl.ops.rigid_flow import rigid_flow
+from vestcl.ops.unproject import unproject
+from vestcl.scene.layers import LayerBatch
+
+__all__ = ["Camera", "Forecaster", "Mode", "Motion", "Perceive", "RenderedView", "Step", "perceive_forecast"]
+
+Mode = Literal["feedback", "compose"]
+Views = Sequence[tuple[torch.Tensor, torch.Tensor]]
+
+#: Frame intervals from t - 1 and from t to t + 1.
+_INTERVALS: Final = (2, 1)
+
+
+class Motion(NamedTuple):
+    """How everything moves to the next frame."""
+
+    next_from_prev: RigidMotion
+    next_from_cur: RigidMotion
+    flow0: torch.Tensor
+    """[B, 6, H, W] m: the rigid flow of the previous frame's pixels, then of the current one's."""
+    objects: ObjectMotionForecast
+    """The flow that is used, each block's candidates, which ran, their probabilities; without object motion the flow
+    is ``flow0`` and L = 0."""
+
+    @property
+    def rigid(self) -> torch.Tensor:
+        """``next_from_cur`` as [B, 4, 4]."""
+        return geometry.compose_rigid(*self.next_from_cur)
+
+
+class Step(NamedTuple):
+    """The forecast of one time, t + k."""
+
+    views: list[RenderedView]
+    """One for each camera asked for."""
+    motion: Motion
+    """Of the interval before t + k; when motion is composed, that of the first interval."""
+    future_from_cur: torch.Tensor
+    """[B, 4, 4] m: from the camera at t to the camera at t + k."""
+
+
+class Forecaster(nn.Module):
+    """Encode, lift, forecast the camera's and then the objects' motion, displace, splat, refine.
+
+    Both input frames become a cloud each: every pixel, and where foreground hides the background that is inpainted
+    behind it. Inpainted points move with the static world, all others as object motion says. Both clouds go to t + 1
+    directly, and are splatted there into every camera that is asked for.
+
+    Args:
+        config: sizes and choices; `vestcl.models.configuration` knows some by name.
+
+    Source: SPEC sections 3 to 6; the paper's overview figure.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config, features = config, config.encoder.features
+        self.encoder = Encoder(config.encoder)
+        self.ego_motion = None if config.ego_motion is None else EgoMotion(config.ego_motion, features)
+        self.object_motion = None if config.object_motion is None else ObjectMotion(config.object_motion, features)
+        self.refine = Refine(config.refine, config.render, features)
+
+    def forward(
+        self, frame_prev: LayerBatch, frame_cur: LayerBatch, K: torch.Tensor, views: Views | None = None
+    ) -> Step:
+        """The next frame with everything that a loss needs: the first step of `forecast`, same arguments."""
+        return self.forecast(frame_prev, frame_cur, K, views=views)[0]
+
+    def forecast(
+        self,
+        frame_prev: LayerBatch,
+        frame_cur: LayerBatch,
+        K: torch.Tensor,
+        steps: int = 1,
+        views: Views | None = None,
+        mode: Mode = "feedback",
+        perceive: Perceive | None = None,
+    ) -> list[Step]:
+        """Forecast t + 1 to t + steps.
+
+        Args:
+            frame_prev: B frames at t - 1; depths above 0, all of one size.
+            frame_cur: the same at t.
+            K: [B, 3, 3] px, of both.
+            steps: number of future frames.
+            views: the cameras to show, as (tgt_from_next [B, 4, 4], K [B, 3, 3]), each at its own future time; None
+                is the source camera alone.
+            mode: "feedback" takes each forecast frame, as the source camera sees it, for an input of the next step;
+                no gradient passes from step to step. "compose" repeats the motion of the first step, the camera's and
+                in the world what objects have beside it, and encodes nothing anew.
+            perceive: for "feedback", (image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W])
+                -> layers of that forecast frame; None is `perceive_forecast`.
+
+        Returns:
+            One `Step` a future frame; differentiable in parameters and images.
+
+        Raises:
+            ValueError: an argument of another shape, a depth that is not above 0, less than one step, another mode.
+        """
+        check_frames(frame_prev, frame_cur, K)
+        if steps < 1 or mode not in ("feedback", "compose"):
+            raise ValueError(f'`steps` must be >= 1 and `mode` "feedback" or "compose", got {steps} and {mode!r}')
+        straight = Camera(torch.eye(4).to(K).expand(len(K), 4, 4), K)
+        cameras = [straight] if views is None else [checked_camera(camera, len(K)) for camera in views]
+        prev, cur = self.encode(frame_prev), self.encode(frame_cur)
+        motion = self.move(prev, cur, K)
+        clouds = self.lift(prev, cur, motion, K)
+        done = [Step([self.show(clouds, camera, motion, K) for camera in cameras], motion, motion.rigid)]
+        while len(done) < steps:
+            if mode == "compose":
+                clouds = [advance(cloud, motion.rigid) for cloud in clouds]
+            else:
+                seen = straight_view(cameras, done[-1].views, straight) or self.show(clouds, straight, motion, K)
+                prev, cur = cur, self.encode(perceive_view(seen, perceive or perceive_forecast))
+                motion = self.move(prev, cur, K)
+                clouds = self.lift(prev, cur, motion, K)
+            views_seen = [self.show(clouds, camera, motion, K) for camera in cameras]
+            done.append(Step(views_seen, motion, motion.rigid @ done[-1].future_from_cur))
+        return done
+
+    # ---------------------------------------------------------------- the figure, from left to right
+
+    def encode(self, frame: LayerBatch) -> EncodedFrame:
+        """Features of a frame and of its background, in one pass; backgrounds without foreground in front are the
+        frame itself.
+
+        Args:
+            frame: layers of B frames.
+
+        Returns:
+            Features [B, C, H, W], and depths replaced where the configuration fixes them.
+        """
+        layers = with_depth(frame, self.config.fixed_depth)
+        batch, _, height, width = layers.image.shape
+        has_foreground = (layers.mask < FOREGROUND_BELOW).flatten(1).any(dim=1)
+        grid = self.encoder(torch.cat([layers.image, layers.background_image[has_foreground]]))
+        own = grid[:batch]
+        features = upsample_features(own, height, width)
+        if not has_foreground.any():
+            return EncodedFrame(layers, features, own, features)
+        rows = torch.arange(batch)
+        rows[has_foreground] = torch.arange(batch, len(grid))
+        background = grid.index_select(0, rows)
+        return EncodedFrame(layers, features, background, upsample_features(background, height, width))
+
+    def move(self, prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor) -> Motion:
+        """The camera's motion from both frames to the next, the rigid flow that it makes, and the objects' flow.
+
+        Args:
+            prev: frame at t - 1.
+            cur: frame at t.
+            K: [B, 3, 3] px.
+
+        Returns:
+            `Motion`; differentiable.
+        """
+        to_next = self.move_camera(prev, cur)
+        flows = [
+            rigid_flow(unproject(frame.layers.depth, K), *rigid)
+            for frame, rigid in zip((prev, cur), to_next, strict=True)
+        ]
+        flow0 = torch.cat(flows, dim=2).unflatten(1, cur.features.shape[2:]).permute(0, 3, 1, 2)
+        return Motion(*to_next, flow0, self.move_objects(prev, cur, to_next, flow0))
+
+    def move_camera(self, prev: EncodedFrame, cur: EncodedFrame) -> tuple[RigidMotion, RigidMotion]:
+        """EMF on the encoder's grid: ``next_from_prev`` and ``next_from_cur``; rest where the model has none."""
+        if self.ego_motion is None:
+            rest = _rest(cur.features)
+            return rest, rest
+        frames = prev, cur
+        return self.ego_motion(
+            *(frame.background_grid for frame in frames),
+            *(grid_depth(frame.layers.background_depth) for frame in frames),
+            *(grid_mean(frame.layers.mask) for frame in frames),
+        )
+
+    def move_objects(
+        self, prev: EncodedFrame, cur: EncodedFrame, to_next: tuple[RigidMotion, RigidMotion], flow0: torch.Tensor
+    ) -> ObjectMotionForecast:
+        """OMF at full size, [B, 6, H, W] m in and out.
+
+        The sky's rigid flow is hundreds of metres in any bend, which no convolution should see: with (R - I) x scaled
+        to a depth of LOG_DEPTH_FAR it is as far as the networks' depth goes. What was taken off is added again.
+        """
+        if self.object_motion is None:
+            none = torch.zeros(len(flow0), 0, dtype=torch.bool)
+            return ObjectMotionForecast(flow0, [], none, None)
+        frames = prev, cur
+        beyond = torch.cat([
+            (1 - LOG_DEPTH_FAR / frame.layers.depth).clamp(min=0) * (flow - rigid.translation[:, :, None, None])
+            for frame, rigid, flow in zip(frames, to_next, flow0.split(3, dim=1), strict=True)
+        ], dim=1)  # fmt: skip
+        objects = self.object_motion(
+            *(frame.features for frame in frames),
+            *(frame.layers.depth for frame in frames),
+            *(frame.layers.mask for frame in frames),
+            flow0 - beyond,
+        )
+        candidates = [candidate + beyond for candidate in objects.candidates]
+        return objects._replace(flow=objects.flow + beyond, candidates=candidates)
+
+    def lift(self, prev: EncodedFrame, cur: EncodedFrame, motion: Motion, K: torch.Tensor) -> list[Cloud]:
+        """Both frames' layers as clouds on their way to t + 1; with `RenderConfig.joint` as one.
+
+        Args:
+            prev: frame at t - 1.
+            cur: frame at t.
+            motion: of both.
+            K: [B, 3, 3] px.
+
+        Returns:
+            N = H W + |M = 0| points an image and frame, packed.
+        """
+        rigid = motion.next_from_prev, motion.next_from_cur
+        flows, flows0 = motion.objects.flow.split(3, dim=1), motion.flow0.split(3, dim=1)
+        clouds = [lift(*arguments, K) for arguments in zip((prev, cur), rigid, flows, flows0, _INTERVALS, strict=True)]
+        return [join(*clouds)] if self.config.render.joint else clouds
+
+    def show(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> RenderedView:
+        """Splat each cloud into a camera, and paint the image.
+
+        Args:
+            clouds: from `lift`.
+            camera: where the view is taken from.
+            motion: that the clouds came by.
+            K: [B, 3, 3] px, of the source camera.
+
+        Returns:
+            The view, of the frames' size; differentiable.
+        """
+        sides = self.splat(clouds, camera, motion, K)
+        return compose_view(sides, self.paint(sides))
+
+    def splat(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> list[Side]:
+        """What each cloud leaves on the view; arguments as in `show`."""
+        height, width = motion.flow0.shape[2:]
+        rigid, rho = motion.rigid.detach(), self.config.render.rho
+        return [splat_cloud(cloud, camera, K, rigid, rho, height, width) for cloud in clouds]
+
+    def paint(self, sides: Sequence[Side]) -> torch.Tensor:
+        """The refined image [B, 3, H, W], from the channels that `RenderConfig.channels` counts."""
+        shown = 4 if self.config.render.colour else 1
+        return self.refine(torch.cat([plane for side in sides for plane in side[:shown]], dim=1))
+
+    # ---------------------------------------------------------------- files
+
+    def save(self, path: Path | str) -> None:
+        """Write weights and configuration to a safetensors file, in one step.
+
+        Args:
+            path: the file, ``*.safetensors``; its folder is made where it does not exist.
+
+        Raises:
+            ValueError: the folder can't be made.
+        """
+        write_checkpoint(path, self.config, self.state_dict())
+
+    @classmethod
+    def load(cls, path: Path | str) -> "Forecaster":
+        """The model that `save` wrote, in evaluation mode, on the CPU.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: a damaged file, one without a configuration, or weights that don't fit it.
+        """
+        config, state = read_checkpoint(path)
+        model = cls(config)
+        try:
+            model.load_state_dict(state)
+        except RuntimeError as error:
+            raise ValueError(f"`path` must hold the weights of {config.name}, got {path} ({error})") from error
+        return model.eval()
+
+
+def _rest(like: torch.Tensor) -> RigidMotion:
+    """No motion, for each image of ``like`` [B, ...]."""
+    quaternion = like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(like), 1)
+    return RigidMotion(quaternion, like.new_zeros(len(like), 3))
