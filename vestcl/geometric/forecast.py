@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
-from vestcl.geometric.holes import fill_holes
+from vestcl.scene.holes import fill_holes
 from vestcl.geometric.perception import Perception, Seen
 from vestcl.geometric.render import Cloud, holes, rendered, show
 from vestcl.scene.ego_motion import constant_velocity
@@ -108,22 +108,16 @@ MovingCloud = Callable[[int, list[NDArray[np.float64]]], Cloud]
 
 
 def _clouds(perception: Perception, index: int) -> list[MovingCloud]:
-    """What the current frame shows; what was static in the one before; what is behind the current foreground."""
+    """What the current frame shows; what the one before did; what is behind the current foreground."""
     K = perception.clip[index].K
     cur, prev = perception.seen(index), perception.seen(index - 1)
     cur_from_prev = np.linalg.inv(perception.prev_from_cur(index))
     everything = np.ones_like(cur.layers.mask)
-    shown = _cloud(cur.layers.image, cur.layers.depth, everything, K, _velocity_map(cur), cur.own)
-    stood = ~prev.own & ~_velocity_map(prev).any(0, keepdims=True)
-    before = _cloud(prev.layers.image, prev.layers.depth, stood, K, None, None, cur_from_prev)
+    shown = _cloud(cur.layers.image, cur.layers.depth, everything, K, cur.velocity, cur.own)
+    before = _cloud(prev.layers.image, prev.layers.depth, ~prev.own, K, prev.velocity, None, cur_from_prev)
     hidden = ~cur.layers.mask & ~cur.own
     behind = _cloud(cur.layers.background_image, cur.layers.background_depth, hidden, K)
     return [shown, before, behind]
-
-
-def _velocity_map(seen: Seen) -> NDArray[np.float64]:
-    """[3, H, W] m a frame."""
-    return np.ascontiguousarray(seen.velocities[seen.things].transpose(2, 0, 1))
 
 
 def _cloud(
@@ -131,7 +125,7 @@ def _cloud(
     depth: NDArray[np.float32],
     which: NDArray[np.bool_],
     K: NDArray[np.float64],
-    velocity: NDArray[np.float64] | None = None,
+    velocity: NDArray[np.float32] | None = None,
     own: NDArray[np.bool_] | None = None,
     cur_from_src: NDArray[np.float64] | None = None,
 ) -> MovingCloud:
@@ -139,9 +133,10 @@ def _cloud(
     y, x = np.nonzero(which[0])
     z = depth[0, y, x].astype(np.float64)
     points = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(K).T * z[:, None]
-    if cur_from_src is not None:
-        points = _transform(cur_from_src, points)
-    speed = np.zeros((1, 3)) if velocity is None else velocity[:, y, x].T
+    speed = np.zeros((1, 3)) if velocity is None else velocity[:, y, x].T.astype(np.float64)
+    if cur_from_src is not None:  # a frame interval ago
+        points = _transform(cur_from_src, points + speed)
+        speed = speed @ cur_from_src[:3, :3].T
     rides = np.zeros((len(x), 1), bool) if own is None else own[0, y, x][:, None]
 
     def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:

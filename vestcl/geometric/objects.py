@@ -6,7 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.scene import _check
+from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import Correspondence, sample
+from vestcl.scene.layers import SKY_DEPTH
 from vestcl.scene.parallax import moved_pixels
 
 #: Neighbours whose depths differ by a larger factor belong to different things.
@@ -32,6 +35,10 @@ _GAIN: Final = 1.5
 
 #: Pixels of a thing that take part, evenly chosen: neighbours say the same.
 _PIXELS: Final = 3000
+
+#: Residual flow beyond so many pixels is no motion but a wrong match, below so many it is noise, and it takes that much
+#: of believed flow around a pixel to speak of one.
+_LARGEST, _NOISE, _SUPPORT = 40.0, 0.2, 0.02
 
 #: Gauss-Newton rounds.
 _ROUNDS: Final = 6
@@ -112,6 +119,50 @@ def velocities(
         measured = np.column_stack([moved[:, y, x].T, inverse_prev[y, x]])
         result[thing] = _velocity(points, measured, inverse_std, prev_from_cur, K)
     return result
+
+
+def follow_flow(
+    velocity: NDArray[np.float32],
+    image: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    correspondence: Correspondence,
+    prev_from_cur: NDArray[np.float64],
+    K: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """``velocity`` corrected, at constant depth, by what flow shows beyond it: v - z' K^-1 r, as far as r is no noise.
+
+    r = p + flow(p) - project(K (R (x - v) + t)), smoothed up to the picture's edges and shrunk by the error of flow:
+    r max(0, 1 - NOISE^2 / |r|^2). Shadows that travel with a car, bodies that bend and errors of depth go on as they
+    did, too.
+
+    Args:
+        velocity: [3, H, W] m a frame.
+        image: [3, H, W] RGB in [0, 1].
+        depth: [1, H, W] m, above 0; the sky keeps its velocity.
+        correspondence: from t to t - 1.
+        prev_from_cur: [4, 4] m.
+        K: [3, 3] px.
+
+    Returns:
+        [3, H, W] m a frame.
+    """
+    height, width = depth.shape[1:]
+    y, x = np.mgrid[:height, :width]
+    rays = np.tensordot(np.linalg.inv(K), np.stack([x + 0.5, y + 0.5, np.ones(depth.shape[1:])]), 1)
+    points = (rays * depth - velocity).reshape(3, -1)
+    there = (prev_from_cur[:3, :3] @ points + prev_from_cur[:3, 3:]).reshape(3, height, width)
+    q = np.tensordot(K, there, 1)
+    residual = moved_pixels(correspondence.flow_uv) - q[:2] / np.maximum(q[2], 0.1)
+    believed = (depth[0] < SKY_DEPTH) & (q[2] > 0.1) & (np.hypot(*residual) < _LARGEST)
+    guide, share = _check.pixels(image), (believed / (1 + correspondence.error[0] ** 4)).astype(np.float32)
+    weight = np.maximum(smooth(guide, share), np.float32(1e-6))
+    planes = [smooth(guide, np.where(believed, share * plane, 0).astype(np.float32)) / weight for plane in residual]
+    shrunk = np.stack(planes) * np.maximum(0, 1 - _NOISE**2 / np.maximum((np.stack(planes) ** 2).sum(0), 1e-9))
+    focal = np.array([K[0, 0], K[1, 1]])[:, None, None]
+    seen = (depth[0] < SKY_DEPTH) & (weight > _SUPPORT)
+    corrected = velocity.copy()
+    corrected[:2] -= np.where(seen, shrunk * there[2] / focal, 0).astype(np.float32)
+    return corrected
 
 
 def _velocity(

@@ -43,8 +43,8 @@ class Seen:
     layers: Layers
     things: NDArray[np.int32]
     """[H, W], 0 = background, else the thing."""
-    velocities: NDArray[np.float64]
-    """[n + 1, 3] m a frame, by thing, in the camera's axes."""
+    velocity: NDArray[np.float32]
+    """[3, H, W] m a frame, in the camera's axes, of what each pixel shows; 0 where it stands still."""
     own: NDArray[np.bool_]
     """[1, H, W], True where the recording car itself is in the picture."""
 
@@ -150,9 +150,11 @@ class Perception:
             depth = refine_depth(depth, self.inverse_std(index), sample.K, [view], mask & ~own)
         layers = build_layers(self.image(index), depth, mask, sky=self._sky(index, depth))
         things = objects.segment(mask, layers.depth)
-        velocities = np.zeros((int(things.max()) + 1, 3))
+        velocity = np.zeros_like(layers.image)
         if index > 0:
             measured = self.raw_depth(index), self.raw_depth(index - 1), self.inverse_std(index)
-            motion = self.correspondence(index), self.prev_from_cur(index)
-            velocities = objects.velocities(things, *measured, *motion, sample.K)
-        return Seen(layers, things, velocities, own)
+            motion = self.correspondence(index), self.prev_from_cur(index), sample.K
+            by_thing = objects.velocities(things, *measured, *motion)
+            velocity = by_thing.astype(np.float32)[things].transpose(2, 0, 1)
+            velocity = objects.follow_flow(velocity, layers.image, layers.depth, *motion)
+        return Seen(layers, things, velocity, own)

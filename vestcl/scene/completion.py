@@ -38,13 +38,16 @@ def complete_depth(depth: ArrayLike, image: ArrayLike) -> NDArray[np.float32]:
         return depth
     guide = _check.pixels(image)
     inverse = np.divide(1, depth, out=np.zeros_like(depth), where=known)[0]
-    share = _smooth(guide, known[0].astype(np.float32))
-    spread = _smooth(guide, inverse) / np.maximum(share, np.float32(1e-12))
+    share = smooth(guide, known[0].astype(np.float32))
+    spread = smooth(guide, inverse) / np.maximum(share, np.float32(1e-12))
     nothing = share <= 1e-9  # an edge all round it: the median of all
     spread = np.where(nothing, np.median(inverse[known[0]]), spread)
     return np.where(known, depth, 1 / np.maximum(spread, np.float32(1 / _FAR)))
 
 
-def _smooth(guide: NDArray[np.uint8], plane: NDArray[np.float32]) -> NDArray[np.float32]:
-    filtered = cv2.ximgproc.fastGlobalSmootherFilter(guide, plane, _LAMBDA, _SIGMA, _DAMPING, _ROUNDS)
+def smooth(guide: NDArray[np.uint8], plane: NDArray[np.float32]) -> NDArray[np.float32]:
+    """G: ``plane`` [H, W] smoothed up to the edges of ``guide`` [H, W, 3]."""
+    filtered = cv2.ximgproc.fastGlobalSmootherFilter(
+        guide, plane, _LAMBDA, _SIGMA, lambda_attenuation=_DAMPING, num_iter=_ROUNDS
+    )
     return np.asarray(filtered, np.float32)

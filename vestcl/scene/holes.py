@@ -1,4 +1,4 @@
-"""What nobody has seen: holes of a view, filled smoothly from what surrounds them, the far side first."""
+"""What nobody has seen: holes of a view, filled smoothly from what surrounds them."""
 
 from typing import Final
 
@@ -15,6 +15,8 @@ def fill_holes(
 ) -> NDArray[np.float32]:
     """Push and pull: a hole takes the weighted mean of the next coarser level, which is filled likewise.
 
+    Holes inside are filled from the far side first, those that reach the border from all sides alike.
+
     Args:
         image: [C, H, W]; what is in the holes does not matter.
         inverse_depth: [1, H, W], 1/m.
@@ -27,10 +29,18 @@ def fill_holes(
     """
     if not hole.any():
         return image
-    weight = np.where(hole, np.float32(0), (inverse_depth + np.float32(_FAR)) ** -2 * np.float32(_FAR**2))[0]
-    planes = np.where(hole, np.float32(0), image).transpose(1, 2, 0)
-    filled = _pull(np.ascontiguousarray(planes), weight).transpose(2, 0, 1)
+    far = (inverse_depth + np.float32(_FAR)) ** -2 * np.float32(_FAR**2)
+    planes = np.ascontiguousarray(np.where(hole, np.float32(0), image).transpose(1, 2, 0))
+    inside, outside = (_pull(planes, np.where(hole[0], np.float32(0), weight)) for weight in (far[0], np.ones_like(far[0])))
+    filled = np.where(_at_border(hole[0])[..., None], outside, inside).transpose(2, 0, 1)
     return np.where(hole, filled, image)
+
+
+def _at_border(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The holes [H, W] that reach the picture's border: nobody hid them, they were out of sight."""
+    _, labels = cv2.connectedComponents(hole.astype(np.uint8))
+    border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    return np.asarray(np.isin(labels, border[border > 0]))
 
 
 def _pull(image: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:

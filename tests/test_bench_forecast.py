@@ -1,0 +1,256 @@
+"""`vestcl bench forecast`: truth formulas by construction, means on known numbers, and whole runs on tiny streets."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from vestcl import cli, metrics, perceptual
+from vestcl.bench import _forecast_tables as tables
+from vestcl.bench import _forecast_truth as known
+from vestcl.bench import _forecast_windows as windows
+from vestcl.bench import forecast as bench
+from vestcl.bench._forecast_windows import GEOMETRIC, ORACLE, SOURCE, TRUE_POSES, Prediction, Record, Truth
+from vestcl.bench.forecast import HELD_OUT, ForecastBench
+from vestcl.compare import FLOW, REPEAT
+from vestcl.data import Street
+from vestcl.data.calibration import invert
+from vestcl.data.sample import Clip, Sample
+from vestcl.forecast import Forecast, Rendered, View
+from vestcl.io.labels import SKY
+from vestcl.models.trunks import Trunk
+
+SIZE = 64, 208
+TINY: dict[str, Any] = {
+    "street_size": SIZE, "height": 64, "width": 208, "steps": 2, "horizons": (1, 2), "street_frames": 6, "samples": 1
+}  # fmt: skip
+SOURCE_VIEW = View(SOURCE, np.eye(4))
+
+
+def street_clip(seed: int = 3, frames: int = 6, samples: int = 1) -> Clip:
+    return Street.generate(seed).clip(frames, *SIZE, samples=samples)
+
+
+def rendered(image: np.ndarray, motion: np.ndarray | None = None, depth: np.ndarray | None = None) -> Rendered:
+    plane = np.ones((1, *image.shape[1:]), np.float32)
+    step = np.zeros_like(image) if motion is None else motion
+    return Rendered(image, plane if depth is None else depth, plane, step)
+
+
+def true_forecast(clip: Clip, index: int, steps: int, offset: float = 0.0) -> Forecast:
+    """What is true, its 3D motion ``offset`` metres wrong in every pixel."""
+    shift = np.array([0, offset, 0], np.float32)[:, None, None]
+    motions = known.true_motion(clip, index, steps)
+    assert motions is not None
+    frames = [
+        {SOURCE: rendered(clip[index + k].read_image(), known.step_truth(clip, index + k) + shift)}
+        for k in range(1, steps + 1)
+    ]
+    return Forecast("truth", motions, frames)
+
+
+# ---------------------------------------------------------------- truth
+
+
+def test_true_motion_brings_a_point_of_the_world_from_camera_to_camera() -> None:
+    clip = street_clip()
+    motions = known.true_motion(clip, 1, 3)
+    assert motions is not None and len(motions) == 3
+    point = np.array([1.0, -2.0, 30.0, 1.0])
+    for step, motion in enumerate(motions, start=1):
+        poses = clip[1].world_from_cam, clip[1 + step].world_from_cam
+        assert poses[0] is not None and poses[1] is not None
+        np.testing.assert_allclose(poses[1] @ motion @ point, poses[0] @ point, atol=1e-9)
+        assert motion[2, 3] < -0.5 * step  # driving forward, 8 m/s and more
+
+
+def test_true_motion_needs_every_pose() -> None:
+    bare = Sample.from_arrays("0", np.zeros((3, 8, 8)), np.eye(3))
+    assert known.true_motion(Clip("bare", "arrays", (bare, bare)), 0, 1) is None
+
+
+def test_step_truth_is_the_cameras_motion_where_nothing_moves() -> None:
+    clip = street_clip()
+    cur, prev = clip[3], clip[2]
+    assert cur.world_from_cam is not None and prev.world_from_cam is not None
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+    points = np.einsum("ij,jhw->ihw", np.linalg.inv(cur.K), np.stack([u, v, np.ones_like(u)])) * cur.read_depth()
+    before = invert(prev.world_from_cam) @ cur.world_from_cam
+    static = cur.read_mask()[0] & (cur.read_labels()[0] != SKY)
+    wanted = points - (np.einsum("ij,jhw->ihw", before[:3, :3], points) + before[:3, 3, None, None])
+    np.testing.assert_allclose(known.step_truth(clip, 3)[:, static], wanted[:, static], atol=1e-3)
+    assert known.step_truth(clip, 3)[2][static].mean() < -0.5  # what stands comes nearer
+
+
+def test_motion_errors_are_what_was_put_in() -> None:
+    clip = street_clip()
+    errors = known.motion_errors(true_forecast(clip, 1, 2, offset=0.25), clip, 1, SOURCE)
+    np.testing.assert_allclose(errors["motion_m"], 0.25, atol=1e-5)
+    np.testing.assert_allclose(errors["motion_known"], 1.0)
+    moving = np.array(errors["moving_m"])
+    np.testing.assert_allclose(moving[~np.isnan(moving)], 0.25, atol=1e-5)
+    assert not np.isnan(moving).all()
+
+
+def test_pixels_without_a_motion_count_as_unknown() -> None:
+    clip = street_clip()
+    frame = true_forecast(clip, 1, 1).frames[0][SOURCE]
+    depth = np.zeros((1, *SIZE), np.float32)
+    depth[:, :, 100:] = 1
+    half = Rendered(frame.image, depth, frame.coverage, np.where(depth > 0, frame.motion_xyz, np.float32(9)))
+    errors = known.motion_errors(Forecast("half", [], [{SOURCE: half}]), clip, 1, SOURCE)
+    solid = clip[2].read_labels() != SKY
+    assert errors["motion_m"][0] == pytest.approx(0, abs=1e-6)
+    assert errors["motion_known"][0] == pytest.approx(solid[:, :, 100:].sum() / solid.sum())
+
+
+def test_ego_errors_by_hand() -> None:
+    truth = np.eye(4)
+    truth[2, 3] = -2.0
+    estimate = truth.copy()
+    estimate[0, 3] = 0.1
+    stands = np.eye(4)
+    errors = known.ego_errors(Forecast("", [estimate, stands], []), [truth, stands])
+    assert errors["translation_percent"][0] == pytest.approx(5.0)
+    assert np.isnan(errors["translation_percent"][1]) and errors["rotation_deg"] == [0.0, 0.0]
+
+
+def test_the_splatter_alone_is_close_to_warping() -> None:
+    values = known.splatter_alone(street_clip(samples=2), 2)
+    loss = values["warped_db"][0] - values["splatted_db"][0]
+    assert values["splatter_loss_db"] == [pytest.approx(loss)]
+    assert loss < 3 and values["warped_db"][0] > 20 and 0.7 < values["seen"][0] < 1
+
+
+def test_only_streets_have_all_truth() -> None:
+    bare = Sample.from_arrays("0", np.zeros((3, 8, 8)), np.eye(3))
+    clip = Clip("bare", "arrays", (bare, bare))
+    assert known.shot(bare) is None
+    with pytest.raises(ValueError, match="must be of a street"):
+        known.step_truth(clip, 1)
+
+
+# ---------------------------------------------------------------- scores and means
+
+
+def test_scores_of_known_errors() -> None:
+    """Truth + 0.1 is 20 dB; the same picture, infinitely good."""
+    clip = street_clip()
+    images = [clip[i].read_image() for i in (2, 3)]
+    grey = [np.clip(image, 0, 0.8).astype(np.float32) for image in images]
+    arrays = tuple(Sample.from_arrays(str(i), image, np.eye(3)) for i, image in enumerate([grey[0], *grey]))
+    truth = Truth(Clip("grey", "arrays", arrays), SIZE, None)
+    off = [image + np.float32(26 / 255) for image in grey]
+    predictions = {SOURCE: {"off": Prediction(off, 1.5), "equal": Prediction(grey, 0.0)}}
+    forecast = Forecast("", [], [{SOURCE: rendered(image)} for image in off])
+    bad, good = windows.score(truth, 0, [SOURCE_VIEW], predictions, forecast)
+    assert (bad.method, bad.view, bad.index, bad.seconds) == ("off", SOURCE, 0, 1.5)
+    np.testing.assert_allclose(bad.scores["psnr"], -20 * np.log10(26 / 255), atol=1e-3)
+    np.testing.assert_allclose(bad.scores["psnr_seen"], bad.scores["psnr"], atol=1e-4)
+    assert good.scores["psnr"] == [np.inf, np.inf] and good.scores["ssim"] == pytest.approx([1, 1])
+    assert "ms_ssim" not in good.scores and "squeeze" not in good.scores
+
+
+def test_the_distance_of_kept_maps_is_the_squeeze_distance() -> None:
+    torch.manual_seed(0)
+    trunk = Trunk("squeezenet1_0").requires_grad_(False).eval()
+    pictures = [np.random.default_rng(seed).random((3, *SIZE)).astype(np.float32) for seed in (0, 1)]
+    first, second = windows.look(pictures, SIZE, trunk)
+    batch = [metrics.quantise(torch.from_numpy(picture)[None]) for picture in pictures]
+    wanted = perceptual.squeeze_distance(batch[0], batch[1], trunk)
+    torch.testing.assert_close(windows._distance(first.maps, second.maps), wanted, rtol=1e-4, atol=1e-6)
+
+
+def record(method: str, index: int, psnr: list[float], view: str = SOURCE) -> Record:
+    return Record("clip", str(index), index, view, method, 2.0 * index, {"psnr": psnr})
+
+
+def test_means_by_hand() -> None:
+    records = [record("a", 1, [10.0, 20.0]), record("a", 2, [14.0, np.nan]), record("b", 1, [np.nan, np.nan])]
+    told = tables.summary(records, [])["views"][SOURCE]
+    assert told["a"]["windows"] == 2 and told["a"]["seconds"] == 3.0
+    assert told["a"]["by_horizon"] == {"psnr": [12.0, 20.0]}
+    assert told["a"]["running_mean"]["psnr"] == pytest.approx([12.0, 16.0])
+    assert np.isnan(told["b"]["by_horizon"]["psnr"]).all()
+    assert tables.finite(told)["b"]["by_horizon"]["psnr"] == [None, None]
+
+
+def test_tables_by_hand() -> None:
+    records = [record("a", 1, [10.0, 20.0]), record("a", 2, [14.0, 30.0]), record("b", 1, [np.nan, 5.0])]
+    (grid,) = tables.picture_grids("clip", records, (2,))
+    assert grid.heading == ("", "PSNR t+2", "s")
+    assert grid.rows == (("a", "25.00", "3.00"), ("b", "5.00", "2.00"))
+    assert grid.title == "clip, view source, mean over 2 windows"
+    lines = tables.to_markdown(grid).splitlines()
+    assert lines[2:5] == ["|  | PSNR t+2 | s |", "| --- | ---: | ---: |", "| a | 25.00 | 3.00 |"]
+    assert tables.fact_grids("clip", [], (1,)) == []
+
+
+# ---------------------------------------------------------------- whole runs
+
+
+def test_windows_have_a_frame_before_and_steps_after() -> None:
+    clip = street_clip(frames=6)
+    assert list(bench.windows_of(clip, ForecastBench(("x",), steps=2))) == [1, 2, 3]
+    assert list(bench.windows_of(clip, ForecastBench(("x",), steps=1, first=2, every=2))) == [2, 4]
+    assert list(bench.windows_of(clip, ForecastBench(("x",), steps=1, last=2))) == [1, 2]
+
+
+def test_inputs() -> None:
+    config = ForecastBench(("x",), **TINY)
+    names = [clip.name for clip in bench.clips_of("street:4-6", config)]
+    assert names == ["street 4", "street 5", "street 6"]
+    assert [clip.name for clip in bench.clips_of("street:7", config)] == ["street 7"]
+    assert [clip.name for clip in bench.clips_of("street:", config)] == [f"street {seed}" for seed in HELD_OUT]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"steps": 0}, "`steps`"),
+        ({"horizons": (1, 3)}, "`horizons` must be steps, 1 ... 2"),
+        ({"views": ()}, "`views`"),
+        ({"inputs": ()}, "`inputs`"),
+        ({"inputs": ("street:5-4",)}, "lower to a higher seed"),
+        ({"street_frames": 3}, "must have 4 frames"),
+        ({"first": 9}, "must have 12 frames"),
+    ],
+)
+def test_what_cannot_be_is_told(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        bench.main(ForecastBench(**({"inputs": ("street:4",)} | TINY | settings)))
+
+
+def test_a_run_prints_and_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, markdown = tmp_path / "new" / "scores.json", tmp_path / "new" / "scores.md"
+    bench.main(ForecastBench(("street:4",), **TINY, out=out, markdown=markdown))
+    printed, results = capsys.readouterr().out, json.loads(out.read_text(encoding="utf-8"))
+    assert {"vestcl", "device", "torch"} <= set(results["machine"])
+    (told,) = results["inputs"]
+    assert set(told["views"]) == {"source", "right"}
+    assert set(told["views"]["source"]) == {REPEAT, FLOW, GEOMETRIC, TRUE_POSES}
+    assert ORACLE in told["views"]["right"]
+    assert len(told["windows"]) == 3 * (4 + 5) and len(told["window_facts"]) == 3
+    own = [w["scores"]["psnr"] for w in told["windows"] if (w["view"], w["method"]) == ("source", GEOMETRIC)]
+    found = told["views"]["source"][GEOMETRIC]["by_horizon"]["psnr"]
+    np.testing.assert_allclose(found, np.mean(own, axis=0))
+    best = {method: of["by_horizon"]["psnr"][0] for method, of in told["views"]["source"].items()}
+    assert best[TRUE_POSES] > best[REPEAT] and best[GEOMETRIC] > best[REPEAT]
+    assert set(told["facts"]) >= {"rotation_deg", "motion_m", "splatter_loss_db"}
+    assert told["facts"]["splatter_loss_db"][0] < 3
+    assert "without --squeeze" in printed and "mean over 3 windows" in printed and "wrote" in printed
+    assert f"| {TRUE_POSES} |" in markdown.read_text(encoding="utf-8")
+
+
+def test_the_command_line_reaches_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", "forecast", "street:4", "--steps", "0"]) == 2
+    assert "`steps` must be 1 or more" in capsys.readouterr().err
+
+
+def test_pooled_inputs_share_a_table() -> None:
+    config = ForecastBench(("street:4", "street:5"), **TINY, pool=True)
+    (group,) = bench._groups(config)
+    assert [clip.name for clip in group.clips] == ["street 4", "street 5"]

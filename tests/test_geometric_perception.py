@@ -1,0 +1,218 @@
+"""vestcl.geometric.perception: what is seen on a street, where it comes from, and what is kept how long."""
+
+import itertools
+import time
+from collections import Counter
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from geometric_scenes import HEIGHT, WIDTH, drive
+
+from vestcl.data.sample import Clip, Sample
+from vestcl.data.sources import DepthArray
+from vestcl.geometric.perception import Perception
+from vestcl.scene.layers import SKY_DEPTH
+
+#: A frame with another on either side.
+FRAME = 2
+
+
+@dataclass(frozen=True)
+class Counted:
+    """A source that says when it is read."""
+
+    source: Any
+    read_one: Any
+
+    @property
+    def height(self) -> int:
+        return self.source.height
+
+    @property
+    def width(self) -> int:
+        return self.source.width
+
+    def read(self) -> Any:
+        self.read_one()
+        return self.source.read()
+
+
+def counted(clip: Clip, counts: Counter[str], *names: str) -> Clip:
+    """Every read of these parts counts as "image 3"."""
+
+    def wrapped(sample: Sample, index: int) -> dict[str, Any]:
+        return {n: Counted(getattr(sample, n), lambda n=n: counts.update([f"{n} {index}"])) for n in names}
+
+    return replace(clip, samples=tuple(replace(s, **wrapped(s, i)) for i, s in enumerate(clip)))
+
+
+def without(clip: Clip, *names: str) -> Clip:
+    """The same clip without depth, labels or a right camera."""
+    nothing: dict[str, Any] = dict.fromkeys(names)
+    return replace(clip, samples=tuple(replace(sample, **nothing) for sample in clip))
+
+
+def relative_error(depth: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Up to 40 m."""
+    near = (depth > 0) & (truth < 40)
+    return np.abs(depth[near] / truth[near] - 1)
+
+
+# ---------------------------------------------------------------- what is seen
+
+
+def test_a_frame_of_the_street() -> None:
+    clip = drive(4).clip
+    seen, sample = Perception(clip).seen(FRAME), clip[FRAME]
+    layers, labels = seen.layers, sample.read_labels()
+    assert np.array_equal(layers.image, sample.read_image())
+    assert np.array_equal(layers.mask, sample.read_mask()) and not seen.own.any()
+    assert (layers.depth > 0).all() and (layers.background_depth >= layers.depth).all()
+    assert (layers.depth[labels == 10] == SKY_DEPTH).all() and (labels == 10).any()
+    assert np.median(relative_error(layers.depth, sample.read_depth())) < 0.01
+    assert seen.things.shape == (HEIGHT, WIDTH) and seen.things.max() > 3
+    assert not seen.things[layers.mask[0]].any()
+
+
+def test_the_first_frame_has_no_motion() -> None:
+    seen = Perception(drive(4).clip).seen(0)
+    assert not seen.velocity.any() and seen.velocity.shape == (3, HEIGHT, WIDTH)
+    assert np.array_equal(Perception(without(drive(4).clip, "labels")).mask(0), np.ones((1, HEIGHT, WIDTH), bool))
+
+
+def test_own_motion_is_as_the_street_drives() -> None:
+    clip = drive(4).clip
+    cur, prev = clip[FRAME].world_from_cam, clip[FRAME - 1].world_from_cam
+    assert cur is not None and prev is not None
+    found, truth = Perception(clip).prev_from_cur(FRAME), np.linalg.inv(prev) @ cur
+    assert truth[2, 3] > 0.5
+    np.testing.assert_allclose(found, truth, atol=0.02)
+
+
+def test_depth_is_the_clips_own() -> None:
+    clip = drive(4).clip
+    assert np.array_equal(Perception(clip).raw_depth(FRAME), clip[FRAME].read_depth())
+
+
+def test_a_scan_is_densified() -> None:
+    """One pixel in 20, as of a laser."""
+    clip = drive(4).clip
+    truth = clip[FRAME].read_depth()
+    scan = np.where(np.random.default_rng(0).random(truth.shape) < 0.05, truth, np.float32(0))
+    sparse = replace(clip, samples=(*clip[:FRAME], replace(clip[FRAME], depth=DepthArray(scan)), *clip[FRAME + 1 :]))
+    depth = Perception(sparse).raw_depth(FRAME)
+    assert (depth > 0).all() and np.median(relative_error(depth, truth)) < 0.05
+
+
+def test_a_pair_gives_depth_where_the_clip_has_none() -> None:
+    clip = drive(4, samples=2).clip
+    depth = Perception(without(clip, "depth")).raw_depth(FRAME)
+    assert (depth > 0).mean() > 0.6 and (depth == 0).any()
+    assert np.median(relative_error(depth, clip[FRAME].read_depth())) < 0.05
+
+
+def test_of_a_pair_depth_is_as_good_as_its_disparity() -> None:
+    """0.35 px over f b."""
+    clip = drive(4).clip
+    expected = 0.35 / (clip[0].K[0, 0] * 0.54)
+    assert Perception(without(clip, "depth")).inverse_std(0) == pytest.approx(expected)
+    assert Perception(clip).inverse_std(0) == Perception(without(clip, "depth", "right")).inverse_std(0)
+
+
+def test_without_labels_motion_makes_the_mask() -> None:
+    """Much of an oncoming car at 10 m is foreground, and little of what stands."""
+    passing = drive(0, start=1.3, samples=2)
+    mask, moving = Perception(without(passing.clip, "labels")).mask(3), passing.moving(3)
+    assert mask.dtype == np.bool_ and moving.mean() > 0.05
+    assert (~mask[0][moving]).mean() > 0.4 > 0.03 > (~mask[0][~moving]).mean()
+
+
+def test_what_rides_along_is_background() -> None:
+    bonnet = np.zeros((1, HEIGHT, WIDTH), bool)
+    bonnet[:, 80:, 100:220] = True
+    clip = drive(4).clip
+    riding = SimpleNamespace(read=lambda: bonnet)
+    seen = Perception(replace(clip, samples=tuple(replace(s, ego_vehicle=riding) for s in clip))).seen(FRAME)
+    assert np.array_equal(seen.own, bonnet)
+    blind = without(replace(clip, samples=tuple(replace(s, ego_vehicle=riding) for s in clip)), "labels")
+    assert Perception(blind).mask(FRAME)[bonnet].all()
+
+
+# ---------------------------------------------------------------- what is kept
+
+
+def test_everything_is_computed_once() -> None:
+    counts: Counter[str] = Counter()
+    stages: list[str] = []
+    perception = Perception(counted(drive(4).clip, counts, "image", "depth"), stages.append)
+    first = perception.seen(FRAME)
+    again = perception.seen(FRAME)
+    assert again is first
+    assert counts == {f"{name} {index}": 1 for name in ("image", "depth") for index in (FRAME - 1, FRAME)}
+    assert Counter(stages) == {"layers": 1, "mask": 1, "depth": 2, "flow": 1, "read": 2, "ego-motion": 1}
+    perception.seen(FRAME + 1)
+    assert counts[f"image {FRAME}"] == counts[f"depth {FRAME}"] == 1
+
+
+def test_old_frames_are_forgotten_and_recent_ones_are_not() -> None:
+    counts: Counter[str] = Counter()
+    perception = Perception(counted(drive(4, frames=10).clip, counts, "image"))
+    for index in (*range(10), 7, 0):
+        perception.image(index)
+    assert counts["image 7"] == 1 and counts["image 0"] == 2
+
+
+def test_a_long_drive_keeps_a_bounded_number_of_frames() -> None:
+    clip = drive(4).clip
+    endless = replace(clip, samples=tuple(itertools.islice(itertools.cycle(clip), 40)))
+    kept = []
+    perception = Perception(endless)
+    for index in range(40):
+        perception.image(index)
+        kept.append(sum(isinstance(value, np.ndarray) for value in perception._kept.values()))
+    assert max(kept) == kept[-1] <= 8
+
+
+def test_seconds_are_exclusive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that only reading moves: an image takes 1 s, a depth 10 s, and nothing is counted twice."""
+    clock = [0.0]
+
+    def slow(sample: Sample, name: str, seconds: float) -> Counted:
+        return Counted(getattr(sample, name), lambda: clock.__setitem__(0, clock[0] + seconds))
+
+    clip = drive(4).clip
+    samples = (replace(s, image=slow(s, "image", 1), depth=slow(s, "depth", 10)) for s in clip)
+    monkeypatch.setattr("vestcl.geometric.perception.time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    perception = Perception(replace(clip, samples=tuple(samples)))
+    perception.seen(FRAME)
+    taken = {stage: seconds for stage, seconds in perception.seconds.items() if seconds}
+    assert taken == {"read": 2, "depth": 20}
+    assert set(perception.seconds) == {"read", "depth", "flow", "ego-motion", "mask", "layers"}
+
+
+def test_seconds_add_up_to_what_it_took() -> None:
+    perception = Perception(drive(4).clip)
+    start = time.perf_counter()
+    perception.seen(FRAME)
+    taken = time.perf_counter() - start
+    assert 0.9 * taken < sum(perception.seconds.values()) <= taken
+
+
+# ---------------------------------------------------------------- what can't be seen
+
+
+def test_no_depth_and_no_second_camera() -> None:
+    clip = without(drive(4).clip, "depth", "right")
+    with pytest.raises(ValueError, match="street 4: has neither depth nor a right camera"):
+        Perception(clip).raw_depth(FRAME)
+
+
+def test_the_first_frame_has_none_before_it() -> None:
+    """It is not the last one, as Python counts."""
+    perception = Perception(drive(4).clip)
+    for result in (perception.correspondence, perception.prev_from_cur):
+        with pytest.raises(ValueError, match="`index` must be 1"):
+            result(0)

@@ -1,0 +1,239 @@
+"""vestcl.scene.motion_depth: a corridor and a street of known depth, standing still, turning, and real driving."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from data_files import pose, real
+
+from vestcl import baselines
+from vestcl.data import Street
+from vestcl.data.kitti_odometry import open_kitti_odometry
+from vestcl.data.sample import Clip
+from vestcl.data.video import open_video
+from vestcl.io.labels import SKY
+from vestcl.scene.correspondence import correspond
+from vestcl.scene.ego_motion import constant_velocity
+from vestcl.scene.layers import SKY_DEPTH
+from vestcl.scene.motion_depth import CAMERA_HEIGHT, MotionDepth, motion_depth
+from vestcl.scene.motion_mask import rigid_pixels
+from vestcl.scene.parallax import moved_pixels
+from vestcl.scene.stereo import stereo_depth
+
+HEIGHT, WIDTH = 160, 288
+K = np.array([[200.0, 0, WIDTH / 2], [0, 200.0, HEIGHT / 2], [0, 0, 1]])
+
+#: The corridor: walls to either side, and one at its end, m.
+ASIDE, END = 5.0, 45.0
+
+
+def corridor(world_from_cam: np.ndarray, car_z: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Picture [3, H, W] and depth [1, H, W] from a camera: the road is at y = CAMERA_HEIGHT; a car is 2 m wide."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(K).T @ world_from_cam[:3, :3].T
+    eye = world_from_cam[:3, 3]
+    with np.errstate(divide="ignore"):
+        planes = [(axis, at, (at - eye[axis]) / rays[..., axis]) for axis, at in
+                  ((1, CAMERA_HEIGHT), (0, -ASIDE), (0, ASIDE), (2, END))]  # fmt: skip
+    best, uv = np.full((HEIGHT, WIDTH), np.inf), np.zeros((HEIGHT, WIDTH, 2))
+    for axis, at, length in planes:
+        there = eye + length[..., None] * rays
+        nearer = (length > 0) & (length < best)
+        best = np.where(nearer, length, best)
+        uv[nearer] = (np.delete(there, axis, -1) + 7.3 * axis + at)[nearer]
+    if car_z is not None:
+        length = (car_z - eye[2]) / rays[..., 2]
+        there = eye + length[..., None] * rays
+        car = (np.abs(there[..., 0]) < 1) & (there[..., 1] > 0.3) & (there[..., 1] < CAMERA_HEIGHT) & (length < best)
+        best, uv[car] = np.where(car, length, best), there[car][:, :2] + 91
+    depth = best * (rays @ world_from_cam[:3, 2])
+    return paint(uv), depth[None].astype(np.float32)
+
+
+def paint(uv: np.ndarray) -> np.ndarray:
+    """Noise of blobs of 0.15 to 1 m, [3, H, W], at metres [H, W, 2]."""
+    rng, grey = np.random.default_rng(4), np.zeros(uv.shape[:2])
+    for size, strength in ((0.15, 0.25), (0.4, 0.3), (1.0, 0.3)):
+        noise = cv2.GaussianBlur(rng.random((512, 512)).astype(np.float32), (0, 0), 0.7)
+        at = np.mod(uv / size, 511).astype(np.float32)
+        grey += strength * cv2.remap(noise, at[..., 0].copy(), at[..., 1].copy(), cv2.INTER_LINEAR)
+    return np.repeat((0.5 + 3 * (grey - 0.425))[None], 3, 0).clip(0, 1).astype(np.float32)
+
+
+def drive(poses: list[np.ndarray], cars: list[float] | None = None) -> tuple[list[np.ndarray], np.ndarray]:
+    """The pictures of a drive down the corridor, and the last one's depth."""
+    shots = [corridor(at, None if cars is None else cars[i]) for i, at in enumerate(poses)]
+    return [image for image, _ in shots], shots[-1][1]
+
+
+def ahead(step: float = 0.4, yaw: float = 0.0, frames: int = 4) -> list[np.ndarray]:
+    """world_from_cam of a straight drive, with a turn of the camera a frame."""
+    return [pose(yaw * i, (0.0, 0.0, step * i)) for i in range(frames)]
+
+
+def off(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    return np.abs(found / true - 1)
+
+
+@pytest.mark.parametrize("frames", [2, 4])
+@pytest.mark.parametrize("yaw", [0.0, 0.004])
+def test_corridor(frames: int, yaw: float) -> None:
+    poses = ahead(yaw=yaw, frames=frames)
+    images, depth = drive(poses)
+    found = motion_depth(images, K)
+    true = np.linalg.inv(poses[-2]) @ poses[-1]
+    assert np.abs(found.prev_from_cur[:3, 3] - true[:3, 3]).max() < (0.1 if frames == 2 else 0.05) * 0.4
+    assert np.abs(found.prev_from_cur[:3, :3] - true[:3, :3]).max() < 1e-3
+    assert np.median(off(found.depth, depth)) < (0.1 if frames == 2 else 0.05)
+    assert (off(found.depth, depth) < 0.25).mean() > 0.9
+
+
+def test_scale_is_the_cameras_height() -> None:
+    images, _ = drive(ahead())
+    low, high = motion_depth(images, K), motion_depth(images, K, camera_height=2 * CAMERA_HEIGHT)
+    assert np.allclose(high.prev_from_cur[:3, 3], 2 * low.prev_from_cur[:3, 3])
+    assert np.allclose(high.prev_from_cur[:3, :3], low.prev_from_cur[:3, :3])
+    assert abs(np.median(high.depth / low.depth) - 2) < 0.05
+
+
+def test_consecutive_frames_share_a_scale() -> None:
+    images, _ = drive(ahead(frames=5))
+    lengths = [np.linalg.norm(motion_depth(images[i : i + 4], K).prev_from_cur[:3, 3]) for i in (0, 1)]
+    assert abs(lengths[0] / lengths[1] - 1) < 0.05
+
+
+def test_same_frames_same_bits() -> None:
+    images, _ = drive(ahead())
+    first, second = motion_depth(images, K), motion_depth(images, K)
+    assert all(np.array_equal(getattr(first, name), getattr(second, name)) for name in MotionDepth._fields)
+
+
+def check_complete(found: MotionDepth) -> None:
+    assert found.depth.dtype == found.confidence.dtype == np.float32
+    assert found.depth.shape == found.confidence.shape == (1, HEIGHT, WIDTH)
+    assert np.isfinite(found.depth).all() and found.depth.min() > 0
+    assert found.confidence.min() >= 0 and found.confidence.max() <= 1
+
+
+def test_standing_still_is_said() -> None:
+    images, depth = drive(ahead(step=0.0))
+    found = motion_depth(images, K)
+    check_complete(found)
+    assert not found.prev_from_cur[:3, 3].any() and not found.confidence.any()
+    assert np.abs(found.prev_from_cur - np.eye(4)).max() < 1e-4
+    assert off(found.depth, depth)[0, 3 * HEIGHT // 4 :, WIDTH // 2].max() < 0.05, "a level road is the guess"
+
+
+def test_pure_rotation_has_no_translation() -> None:
+    poses = [pose(0.01 * i) for i in range(4)]
+    found = motion_depth(drive(poses)[0], K)
+    check_complete(found)
+    assert not found.prev_from_cur[:3, 3].any()
+    assert np.abs(found.prev_from_cur - np.linalg.inv(poses[-2]) @ poses[-1]).max() < 1e-3
+
+
+def test_stop_after_a_drive_keeps_the_depth() -> None:
+    poses = ahead(frames=3)
+    images, depth = drive([*poses, poses[-1]])
+    found = motion_depth(images, K)
+    assert not found.prev_from_cur[:3, 3].any()
+    assert np.median(off(found.depth, depth)) < 0.1
+
+
+def test_car_that_keeps_its_distance_stands_on_the_road() -> None:
+    """It does not move in the picture, as if it were infinitely far away."""
+    poses = ahead()
+    images, depth = drive(poses, [at[2, 3] + 10.0 for at in poses])
+    found = motion_depth(images, K)
+    car = np.abs(depth - 10) < 1e-3
+    car[0, : HEIGHT // 2 + 8] = False  # its roof is hard to tell from what is behind it
+    assert np.median(off(found.depth, depth)[car]) < 0.15
+
+
+def test_nothing_to_see() -> None:
+    found = motion_depth([np.full((3, HEIGHT, WIDTH), 0.5, np.float32)] * 2, K)
+    check_complete(found)
+    assert np.array_equal(found.prev_from_cur, np.eye(4)) and not found.confidence.any()
+
+
+def test_pictures_without_common_content() -> None:
+    rng = np.random.default_rng(0)
+    found = motion_depth([rng.random((3, HEIGHT, WIDTH), np.float32) for _ in range(3)], K)
+    check_complete(found)
+    assert np.linalg.norm(found.prev_from_cur[:3, 3]) < 6.001
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"images": [np.zeros((3, 20, 20))]}, "`images` must be two or more, got 1"),
+        ({"images": [np.zeros((3, 20, 20)), np.zeros((3, 20, 21))]}, r"`images\[1\]` must be \[3, 20, 20\]"),
+        ({"images": [np.zeros((3, 20, 20)), np.full((3, 20, 20), np.nan)]}, r"`images\[1\]` must be finite"),
+        ({"K": np.eye(4)}, r"`K` must be \[3, 3\], got \[4, 4\]"),
+        ({"camera_height": 0.0}, "`camera_height` must be above 0 m, got 0"),
+    ],
+)
+def test_errors(change: dict[str, Any], message: str) -> None:
+    arguments: dict[str, Any] = {"images": [np.zeros((3, 20, 20))] * 2, "K": K} | change
+    with pytest.raises(ValueError, match=message):
+        motion_depth(**arguments)
+
+
+def prev_from_cur(clip: Clip, index: int) -> np.ndarray:
+    """By the clip's own poses."""
+    prev, cur = clip[index - 1].world_from_cam, clip[index].world_from_cam
+    assert prev is not None and cur is not None
+    return np.linalg.inv(prev) @ cur
+
+
+def test_correspondence_may_be_given() -> None:
+    images, _ = drive(ahead())
+    known = correspond(images[-1], images[-2])
+    assert np.array_equal(motion_depth(images, K, correspondence=known).depth, motion_depth(images, K).depth)
+
+
+def test_street() -> None:
+    clip = Street.generate(3).clip(4, 128, 320, samples=2)
+    last = clip[3]
+    found = motion_depth([sample.read_image() for sample in clip], last.K, camera_height=1.65)
+    depth = last.read_depth()
+    near = depth < 60
+    assert np.median(off(found.depth, depth)[near]) < 0.15
+    true = prev_from_cur(clip, 3)
+    assert np.abs(found.prev_from_cur[:3, 3] - true[:3, 3]).max() < 0.15 * np.linalg.norm(true[:3, 3])
+    sky = last.read_labels() == SKY
+    assert (found.depth[sky] == SKY_DEPTH).mean() > 0.8
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(((a - b) ** 2).mean()))
+
+
+def test_motorway_forecast_beats_repeating() -> None:
+    """The next frame of a plain video, warped by the depth and the extrapolated motion."""
+    clip = open_video(real("highway.mp4"))
+    images = [clip[i].read_image() for i in range(27, 32)]
+    found = motion_depth(images[:-1], clip[0].K)
+    assert 0.5 < found.prev_from_cur[2, 3] < 1.5, "a motorway's speed at 25 frames a second"
+    motion = constant_velocity([np.asarray(np.linalg.inv(found.prev_from_cur), np.float64)])
+    shape = np.zeros((2, *found.depth.shape[1:]), np.float32)
+    flow = (rigid_pixels(found.depth, clip[0].K, motion) - moved_pixels(shape)).astype(np.float32)
+    back = baselines.invert_flow(torch.from_numpy(flow)[None])
+    warped = baselines.backward_warp(torch.from_numpy(images[-2])[None], back)[0].numpy()
+    assert psnr(warped, images[-1]) > psnr(images[-2], images[-1]) + 1
+
+
+def test_real_street_against_its_stereo_pair() -> None:
+    clip = open_kitti_odometry(real("kitti_odometry"))
+    found = motion_depth([clip[i].read_image() for i in range(17, 21)], clip[20].K, camera_height=1.65)
+    sample = clip[20]
+    assert sample.right is not None
+    stereo = stereo_depth(
+        sample.read_image(), sample.right.read_image(), sample.K, sample.right.right_from_left, fill=False
+    )
+    known = (stereo > 0) & (stereo < 80)
+    assert np.median(off(found.depth[known], stereo[known])) < 0.12
+    true = prev_from_cur(clip, 20)
+    assert abs(np.linalg.norm(found.prev_from_cur[:3, 3]) / np.linalg.norm(true[:3, 3]) - 1) < 0.1

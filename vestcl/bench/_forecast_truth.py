@@ -1,0 +1,236 @@
+"""What `vestcl bench forecast` knows beside pictures: true camera motion, true 3D motion, the splatter on true scenes.
+
+Camera motion is known where a clip has poses; the rest of procedural streets alone.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vestcl import metrics
+from vestcl.data import calibration
+from vestcl.data.sample import Clip, Sample
+from vestcl.data.street_clip import Shot, StreetImage
+from vestcl.forecast import Forecast
+from vestcl.geometric.render import Cloud, show
+from vestcl.io.labels import SKY, background
+
+#: A thing that moves by less than that by itself from frame to frame (metres) stands.
+STILL: Final = 0.01
+
+#: A point is seen where the depth map, interpolated as 1 / depth, is not nearer than the point by a larger factor.
+_HIDDEN: Final = 1.03
+
+#: Points nearer than that (metres) are not in the picture, and not divided by.
+_NEAREST: Final = 0.1
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Errors of one window's forecast other than in pictures."""
+
+    clip: str
+    frame: str
+    index: int
+    """Of the current frame t in the clip."""
+    values: dict[str, list[float]]
+    """By what is measured, a number a step."""
+
+
+def true_motion(clip: Clip, index: int, steps: int) -> list[Array] | None:
+    """future_from_cur = world_from_cam(t + k)^-1 world_from_cam(t) for k = 1 ... steps.
+
+    Args:
+        clip: frames with or without poses.
+        index: the current frame t.
+        steps: k's end; t + steps is a frame.
+
+    Returns:
+        [4, 4] m a step, or None where a pose is unknown.
+    """
+    poses = [sample.world_from_cam for sample in clip[index : index + steps + 1]]
+    known = [pose for pose in poses if pose is not None]
+    if len(known) < len(poses):
+        return None
+    return [calibration.invert(pose) @ known[0] for pose in known[1:]]
+
+
+def shot(sample: Sample) -> Shot | None:
+    """How the street took this sample, or None: it is no street's."""
+    return sample.image.shot if isinstance(sample.image, StreetImage) else None
+
+
+def ego_errors(forecast: Forecast, truth: list[Array]) -> dict[str, list[float]]:
+    """`metrics.ego_motion_error` of ``future_from_cur``, step by step.
+
+    Args:
+        forecast: with ``future_from_cur``.
+        truth: see `true_motion`.
+
+    Returns:
+        "rotation_deg" and "translation_percent"; the latter NaN where the car stood.
+    """
+    estimate, wanted = (torch.from_numpy(np.stack(motions)) for motions in (forecast.future_from_cur, truth))
+    errors = metrics.ego_motion_error(estimate, wanted)
+    return {name: values.tolist() for name, values in errors._asdict().items()}
+
+
+def step_truth(clip: Clip, index: int) -> NDArray[np.float32]:
+    """x_t - x_(t-1) of what each pixel of a street's frame t shows, each in its own time's camera.
+
+    `Street.motion` from t back to t - 1 is x_(t-1) - x_t on the grid of t: this is minus that.
+
+    Args:
+        clip: of a street, at the street's own size.
+        index: the frame t, 1 or more.
+
+    Returns:
+        [3, H, W] m.
+
+    Raises:
+        ValueError: the clip is of no street.
+    """
+    return -_motion(clip[index], clip[index - 1])
+
+
+def motion_errors(forecast: Forecast, clip: Clip, index: int, view: str) -> dict[str, list[float]]:
+    """Mean |motion_xyz - truth| over the pixels of t + k that are not sky and that the forecast shows something at.
+
+    Args:
+        forecast: of a street, at the street's own size.
+        clip: the street's.
+        index: the current frame t.
+        view: name of the source view in ``forecast``.
+
+    Returns:
+        "motion_m" over all of these pixels, "moving_m" over those of them that show what moves by itself, by STILL or
+        more (NaN without any), and "motion_known", their share of all pixels that are not sky.
+    """
+    errors: dict[str, list[float]] = {"motion_m": [], "moving_m": [], "motion_known": []}
+    for step, frame in enumerate(forecast.frames, start=1):
+        after, before = clip[index + step], clip[index + step - 1]
+        truth = step_truth(clip, index + step)
+        solid = after.read_labels() != SKY
+        known = solid & (frame[view].depth > 0)
+        own = np.linalg.norm(truth + _rigid_step(after, before), axis=0)[None] > STILL
+        missed, wanted = (torch.from_numpy(each.reshape(1, 3, -1)).mT for each in (frame[view].motion_xyz, truth))
+        for name, mask in (("motion_m", known), ("moving_m", known & own)):
+            inside = torch.from_numpy(mask.reshape(1, -1))
+            errors[name].append(float(metrics.end_point_error(missed, wanted, inside)))
+        errors["motion_known"].append(float(known.sum() / max(solid.sum(), 1)))
+    return errors
+
+
+def splatter_alone(clip: Clip, index: int) -> dict[str, list[float]]:
+    """PSNR of t + 1 splatted from t with everything true, and warped back from t with everything true.
+
+    - Splatted: depth and `Street.motion` of t, with what stands behind the foreground from a picture without it.
+    - Warped: I(p) = I_t(project(x + u)) with depth x and motion u from t + 1 back to t, bilinear.
+
+    Both over the pixels of t + 1 whose point is in the picture at t and not hidden there by something nearer.
+
+    Args:
+        clip: of a street, at the street's own size.
+        index: the frame t.
+
+    Returns:
+        "splatted_db", "warped_db", "splatter_loss_db" (the second less the first) and "seen", the pixels' share; one
+        number each.
+
+    Raises:
+        ValueError: the clip is of no street.
+    """
+    cur, after = clip[index], clip[index + 1]
+    image, depth = cur.read_image(), cur.read_depth()
+    origin = _points(after) + _motion(after, cur)
+    projected = np.einsum("ij,jhw->ihw", cur.K, origin)
+    uv = (projected[:2] / np.maximum(projected[2], _NEAREST)).astype(np.float32)
+    inside = (origin[2] > _NEAREST) & (uv > 0).all(0) & (uv[0] < cur.width) & (uv[1] < cur.height)
+    hidden = origin[2] * _sample(np.float32(1) / depth, uv)[0] > _HIDDEN
+    splatted = show(_true_clouds(cur, after), after.K, np.eye(4), after.height, after.width).planes[:3]
+    mask = torch.from_numpy(inside & ~hidden)[None, None]
+    truth = _eight_bit(after.read_image())
+    splat_db, warp_db = (float(metrics.psnr(_eight_bit(made), truth, mask)) for made in (splatted, _sample(image, uv)))
+    values = {"splatted_db": splat_db, "warped_db": warp_db, "splatter_loss_db": warp_db - splat_db}
+    return {name: [value] for name, value in (values | {"seen": float(mask.double().mean())}).items()}
+
+
+def _true_clouds(cur: Sample, after: Sample) -> list[Cloud]:
+    """What the frame shows, and what stands behind its foreground, where they are one frame on."""
+    taken = _taken(cur)
+    behind = Shot(taken.street, taken.t, taken.aside, taken.size, taken.samples, foreground=False).take()
+    points, moved = _points(cur), _points(cur) + _motion(cur, after)
+    all_of_it = np.ones((cur.height, cur.width), bool)
+    hidden = ~background(cur.read_labels())[0]
+    rigid = _rigid(cur, after, _lift(behind.depth[0], cur.K), behind.labels[0] == SKY)
+    return [
+        _cloud(cur.read_image(), points, moved, all_of_it),
+        _cloud(behind.colour[0], _lift(behind.depth[0], cur.K), rigid, hidden),
+    ]
+
+
+def _cloud(colour: NDArray[np.float32], points: Array, moved: Array, which: NDArray[np.bool_]) -> Cloud:
+    """The pixels of ``which`` [H, W]."""
+    rows, columns = np.nonzero(which)
+    there, came = (each[:, rows, columns].T.astype(np.float32) for each in (moved, moved - points))
+    z_src = points[2, rows, columns].astype(np.float32)
+    return Cloud(there, z_src, colour[:, rows, columns].T, came, rows, columns)
+
+
+def _motion(cur: Sample, after: Sample) -> NDArray[np.float32]:
+    """`Street.motion` from one sample to another, before or after it: x_after - x_cur, [3, H, W] m."""
+    start, end = _taken(cur), _taken(after)
+    cur_from_world, after_from_world = calibration.invert(_pose(cur)), calibration.invert(_pose(after))
+    return start.street.motion(cur_from_world, after_from_world, cur.K, cur.height, cur.width, start.t, end.t)
+
+
+def _rigid_step(cur: Sample, after: Sample) -> Array:
+    """What `_motion` would be if nothing moved but the camera."""
+    points = _points(cur)
+    return _rigid(cur, after, points, cur.read_labels() == SKY) - points
+
+
+def _rigid(cur: Sample, after: Sample, points: Array, sky: NDArray[np.bool_]) -> Array:
+    """``points`` [3, H, W] m in the camera of ``after``; the sky [1, H, W] only turns."""
+    after_from_cur = calibration.invert(_pose(after)) @ _pose(cur)
+    turned = np.einsum("ij,jhw->ihw", after_from_cur[:3, :3], points)
+    return turned + np.where(sky, 0.0, after_from_cur[:3, 3, None, None])
+
+
+def _points(sample: Sample) -> Array:
+    return _lift(sample.read_depth(), sample.K)
+
+
+def _lift(depth: NDArray[np.float32], K: Array) -> Array:
+    """[3, H, W] m: z K^-1 (u, v, 1) at pixel centres."""
+    v, u = np.mgrid[: depth.shape[1], : depth.shape[2]] + 0.5
+    return np.einsum("ij,jhw->ihw", np.linalg.inv(K), np.stack([u, v, np.ones_like(u)])) * depth
+
+
+def _sample(planes: NDArray[np.float32], uv: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``planes`` [C, H, W] at ``uv`` [2, H, W] px, bilinear; the border is repeated."""
+    u, v = uv - np.float32(0.5)  # OpenCV counts from pixel centres
+    return np.stack([cv2.remap(plane, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in planes])
+
+
+def _eight_bit(image: NDArray[np.float32]) -> torch.Tensor:
+    return metrics.quantise(torch.from_numpy(np.ascontiguousarray(image))[None])
+
+
+def _taken(sample: Sample) -> Shot:
+    taken = shot(sample)
+    if taken is None or sample.size is not None:
+        raise ValueError(f"`clip` must be of a street at its own size, got sample {sample.name}")
+    return taken
+
+
+def _pose(sample: Sample) -> Array:
+    if sample.world_from_cam is None:
+        raise ValueError(f"sample {sample.name} must have a pose, got none")
+    return sample.world_from_cam

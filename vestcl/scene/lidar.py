@@ -1,0 +1,79 @@
+"""Dense depth from a laser scan: what shines through is dropped, the rest is spread up to the picture's edges."""
+
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage  # type: ignore[import-untyped]
+from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+
+from vestcl.scene import _check
+from vestcl.scene.layers import SKY_DEPTH
+
+#: A return shines through a nearer surface if more than half of its nearest returns, so many, have inverse depths above
+#: its own by that ratio. Rows of a scan are about twice as far apart in the picture as returns in a row.
+_NEIGHBOURS, _THROUGH, _ROW = 9, 0.8, 0.5
+
+#: Strength of the smoother, how much it minds edges of the picture (of 255), its damping and rounds. With a fifth of
+#: the returns of kitti_clip held out, 3.5 % of them are off by above 10 %; 4.2 % with a strength of 20, 3.9 % with
+#: edges of 10, and 4.8 % with the nearest return.
+_STRENGTH, _EDGES, _DAMPING, _ROUNDS = 2.0, 4.0, 0.25, 3
+
+#: The smoothed weight of returns below which a value is rounding error, and the nearest pixel's is taken.
+_REACHED: Final = 1e-9
+
+
+def densify(depth: ArrayLike, image: ArrayLike, *, sky: ArrayLike | None = None) -> NDArray[np.float32]:
+    """Inverse depth by normalised edge-aware smoothing, G(s m) / G(m), with m = 1 at a return and 0 elsewhere.
+
+    Returns that shine through a nearer surface are dropped first. Where no return reaches, as above all of them, the
+    nearest smoothed value goes on.
+
+    Args:
+        depth: [1, H, W] m, 0 = no return.
+        image: [3, H, W] RGB in [0, 1].
+        sky: [1, H, W] bool, True = sky, which gets SKY_DEPTH; None has no sky.
+
+    Returns:
+        [1, H, W] m, above 0.
+
+    Raises:
+        ValueError: shapes, numbers that aren't finite, or no return.
+
+    Source: Min et al., Fast Global Image Smoothing Based on Weighted Least Squares, 2014.
+    """
+    depth = _check.depth("depth", depth)
+    image = _check.planes("image", image, 3, depth)
+    far = np.zeros(depth.shape, bool) if sky is None else _check.mask("sky", sky, depth)
+    inverse = _without_shine_through(depth[0])
+    return np.where(far, np.float32(SKY_DEPTH), 1 / _spread(inverse, _check.pixels(image))[None])
+
+
+def _without_shine_through(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """1 / depth [H, W] of the returns that are kept, 0 elsewhere."""
+    rows, columns = np.nonzero(depth)
+    inverse = 1 / depth[rows, columns]
+    places = np.stack([columns, _ROW * rows], axis=1)
+    count = min(_NEIGHBOURS + 1, len(places))
+    _, nearest = cKDTree(places).query(places, count)
+    beside = inverse[nearest.reshape(len(places), count)[:, 1:]]
+    hidden = (inverse[:, None] < _THROUGH * beside).mean(axis=1) > 0.5 if count > 1 else np.zeros(len(places), bool)
+    kept = np.zeros_like(depth)
+    kept[rows[~hidden], columns[~hidden]] = inverse[~hidden]
+    return kept
+
+
+def _spread(inverse: NDArray[np.float32], guide: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """[H, W], above 0 everywhere."""
+    total, share = (
+        cv2.ximgproc.fastGlobalSmootherFilter(
+            guide, plane, _STRENGTH, _EDGES, lambda_attenuation=_DAMPING, num_iter=_ROUNDS
+        )
+        for plane in (inverse, (inverse > 0).astype(np.float32))
+    )
+    reached = (share > _REACHED) & (total > 0)
+    if not reached.any():  # one return between edges: it is all there is
+        total, share, reached = inverse, np.ones_like(inverse), inverse > 0
+    rows, columns = ndimage.distance_transform_edt(~reached, return_distances=False, return_indices=True)
+    return np.asarray(total[rows, columns] / share[rows, columns], np.float32)
