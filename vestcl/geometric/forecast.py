@@ -84,6 +84,8 @@ def forecast_frames(
     if steps < 1 or not views:
         raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
     cameras = _extrapolate(perception, index, steps) if future_from_cur is None else list(future_from_cur)
+    if len(cameras) < steps:
+        raise ValueError(f"`future_from_cur` must be of {steps} steps or more, got {len(cameras)}")
     clouds = _clouds(perception, index)
     start, frames = time.perf_counter(), []
     for step in range(1, steps + 1):

@@ -27,8 +27,9 @@ _FLOW_STD, _HUBER = 0.5, 2.0
 #: So many neighbouring pixels err alike, and count as one.
 _ALIKE: Final = 50.0
 
-#: What is expected of a velocity before anything is measured: metres a frame, each axis (20 m/s at 10 Hz).
-_SPEED_STD: Final = 2.0
+#: What is expected of a velocity before anything is measured, metres a frame: 20 m/s at 10 Hz across and ahead, and
+#: nothing jumps.
+_SPEED_STD: Final = (2.0, 0.1, 2.0)
 
 #: A thing is said to move if that explains its flow so much better: mean robust cost, in variances of flow.
 _GAIN: Final = 1.5
@@ -36,9 +37,12 @@ _GAIN: Final = 1.5
 #: Pixels of a thing that take part, evenly chosen: neighbours say the same.
 _PIXELS: Final = 3000
 
-#: Residual flow beyond so many pixels is no motion but a wrong match, below so many it is noise, and it takes that much
-#: of believed flow around a pixel to speak of one.
-_LARGEST, _NOISE, _SUPPORT = 40.0, 0.2, 0.02
+#: Residual flow beyond so many pixels is no motion but a wrong match, and below so many it is noise.
+_LARGEST, _NOISE = 40.0, 0.2
+
+#: Up to that share of believed flow around a pixel nothing is corrected, from that one on everything: bare asphalt has
+#: little, and would heave.
+_WEAK, _STRONG = 0.15, 0.35
 
 #: Gauss-Newton rounds.
 _ROUNDS: Final = 6
@@ -67,15 +71,16 @@ def segment(mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> NDArray[np.i
 
 
 def _grown(things: NDArray[np.int32], foreground: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Foreground that no thing owns goes to the nearest one."""
+    """Foreground that no thing owns goes to the nearest one, if it touches it: others are too small to measure."""
     if not things.any():
         return things
     _, nearest = cv2.distanceTransformWithLabels(
         (things == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    owner = np.zeros(nearest.max() + 1, np.int32)
-    owner[nearest[things > 0]] = things[things > 0]
-    return np.where(foreground, owner[nearest], 0)
+    _, parts = cv2.connectedComponents(foreground.astype(np.uint8), connectivity=8)
+    owner, part = np.zeros((2, nearest.max() + 1), np.int32)
+    owner[nearest[things > 0]], part[nearest[things > 0]] = things[things > 0], parts[things > 0]
+    return np.where(foreground & (part[nearest] == parts), owner[nearest], 0)
 
 
 def velocities(
@@ -159,9 +164,9 @@ def follow_flow(
     planes = [smooth(guide, np.where(believed, share * plane, 0).astype(np.float32)) / weight for plane in residual]
     shrunk = np.stack(planes) * np.maximum(0, 1 - _NOISE**2 / np.maximum((np.stack(planes) ** 2).sum(0), 1e-9))
     focal = np.array([K[0, 0], K[1, 1]])[:, None, None]
-    seen = (depth[0] < SKY_DEPTH) & (weight > _SUPPORT)
+    trust = ((weight - _WEAK) / (_STRONG - _WEAK)).clip(0, 1) * (depth[0] < SKY_DEPTH)
     corrected = velocity.copy()
-    corrected[:2] -= np.where(seen, shrunk * there[2] / focal, 0).astype(np.float32)
+    corrected[:2] -= (trust * shrunk * there[2] / focal).astype(np.float32)
     return corrected
 
 
@@ -172,14 +177,15 @@ def _velocity(
     """One thing's v [3], or 0 if that explains as much. ``measured`` [N, 3]: px, px, 1/m."""
     known = np.column_stack([np.ones((len(points), 2), bool), measured[:, 2] > 0])
     spread = np.array([_FLOW_STD, _FLOW_STD, 2 * inverse_std])
+    prior = np.diag(np.square(np.reciprocal(_SPEED_STD)))
     v, cost = np.zeros(3), []
     for _ in range(_ROUNDS):
         predicted, jacobian = _predict(points, v, prev_from_cur, K)
         residual = np.where(known, (measured - predicted) / spread, 0)
         weight = known * np.minimum(1, _HUBER / np.maximum(np.abs(residual), 1e-9)) / _ALIKE
         scaled = jacobian / spread[:, None]
-        normal = np.einsum("nij,ni,nik->jk", scaled, weight, scaled) + np.eye(3) / _SPEED_STD**2
-        right = np.einsum("nij,ni,ni->j", scaled, weight, residual) - v / _SPEED_STD**2
+        normal = np.einsum("nij,ni,nik->jk", scaled, weight, scaled) + prior
+        right = np.einsum("nij,ni,ni->j", scaled, weight, residual) - prior @ v
         v = v + np.linalg.solve(normal, right)
         cost.append(_cost(residual))
     predicted, _ = _predict(points, v, prev_from_cur, K)

@@ -16,6 +16,7 @@ from vestcl.scene.correspondence import Correspondence, correspond
 from vestcl.scene.ego_motion import ego_motion
 from vestcl.scene.layers import Layers, build_layers
 from vestcl.scene.lidar import densify
+from vestcl.scene.motion_depth import MotionDepth, motion_depth
 from vestcl.scene.motion_mask import motion_mask
 from vestcl.scene.parallax import View, refine_depth
 from vestcl.scene.sky import sky_mask
@@ -69,6 +70,8 @@ class Perception:
 
     def correspondence(self, index: int) -> Correspondence:
         """From frame ``index`` to the one before."""
+        if not 1 <= index < len(self.clip):
+            raise ValueError(f"`index` must be 1 ... {len(self.clip) - 1}, a frame with one before, got {index}")
         return self._once("flow", index, lambda: correspond(self.image(index), self.image(index - 1)))
 
     def raw_depth(self, index: int) -> NDArray[np.float32]:
@@ -114,14 +117,28 @@ class Perception:
             depth = sample.read_depth()
             return depth if (depth > 0).mean() >= _DENSE else densify(depth, self.image(index), sky=self._sky(index))
         if sample.right is None:
-            raise ValueError(f"{self.clip.name}: has neither depth nor a right camera")
+            return self._from_motion(index).depth
         focal = -float(sample.K[0, 0] * sample.right.right_from_left[0, 3])
         searched = min(math.ceil(focal / _NEAREST), sample.width // 2)
         pair = self.image(index), sample.right.read_image()
         rig = sample.right.right_from_left
         return stereo_depth(*pair, sample.K, rig, max_disparity=searched, fill=False)
 
+    def _is_monocular(self, index: int) -> bool:
+        return self.clip[index].depth is None and self.clip[index].right is None
+
+    def _from_motion(self, index: int) -> MotionDepth:
+        if len(self.clip) < 2:
+            raise ValueError(f"{self.clip.name}: needs two frames, a right camera or depth, got one frame alone")
+        if index == 0:  # nothing is before it, so what comes after has to do
+            return self._once("motion depth", 0, lambda: motion_depth([self.image(1), self.image(0)], self.clip[0].K))
+        images = [self.image(i) for i in range(max(index - 2, 0), index + 1)]
+        known = self.correspondence(index)
+        return self._once("motion depth", index, lambda: motion_depth(images, self.clip[index].K, correspondence=known))
+
     def _ego_motion(self, index: int) -> NDArray[np.float64]:
+        if self._is_monocular(index):
+            return self._from_motion(index).prev_from_cur
         sample = self.clip[index]
         static = ~sample.read_ego_vehicle()
         if sample.labels is not None:
@@ -136,7 +153,7 @@ class Perception:
         if index == 0:
             return np.ones((1, sample.height, sample.width), bool)
         mask = motion_mask(self.raw_depth(index), self.correspondence(index), self.prev_from_cur(index), sample.K)
-        return mask | sample.read_ego_vehicle()
+        return mask | sample.read_ego_vehicle() | self._sky(index, self.raw_depth(index))
 
     def _sky(self, index: int, depth: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:
         sample = self.clip[index]
@@ -145,14 +162,17 @@ class Perception:
     def _see(self, index: int) -> Seen:
         sample, mask, depth = self.clip[index], self.mask(index), self.raw_depth(index)
         own = sample.read_ego_vehicle()
-        if index > 0:
+        if index > 0 and not self._is_monocular(index):
             view = View(self.correspondence(index), self.prev_from_cur(index))
             depth = refine_depth(depth, self.inverse_std(index), sample.K, [view], mask & ~own)
         layers = build_layers(self.image(index), depth, mask, sky=self._sky(index, depth))
         things = objects.segment(mask, layers.depth)
         velocity = np.zeros_like(layers.image)
         if index > 0:
-            measured = self.raw_depth(index), self.raw_depth(index - 1), self.inverse_std(index)
+            before = self.raw_depth(index - 1)
+            if self._is_monocular(index):  # two depths whose scales may differ by more than a thing moves
+                before = np.zeros_like(before)
+            measured = self.raw_depth(index), before, self.inverse_std(index)
             motion = self.correspondence(index), self.prev_from_cur(index), sample.K
             by_thing = objects.velocities(things, *measured, *motion)
             velocity = by_thing.astype(np.float32)[things].transpose(2, 0, 1)

@@ -18,9 +18,10 @@ RADIUS_LIMITS: Final = (0.5, 8.0)
 _OPAQUE: Final = 0.5
 
 #: Pixels that were next to each other belong to one surface if the view shows them no farther apart than that, times
-#: what it magnifies; and a surface is where a pixel has so many of its eight neighbours. The rest is spray: pixels at
-#: edges whose depth lies between that of the near and the far side.
-_TORN, _NEIGHBOURS = 2.5, 3
+#: what it magnifies; and a surface is where a pixel has so many of its eight neighbours, or two on a line: a pole of one pixel has one above
+#: and one below, no farther apart than `_LINE`. The rest is spray: pixels at edges whose depth lies between that of the
+#: near and the far side.
+_TORN, _NEIGHBOURS, _LINE = 2.5, 3, 1.1
 
 #: Less coverage than that is a hole.
 _HOLE: Final = 0.05
@@ -90,7 +91,7 @@ def _splat(
     )
     zoom = cloud.z_src / np.maximum(z[0], np.float32(1e-3))
     radii = np.clip(RHO * zoom, *RADIUS_LIMITS)[None]
-    opacities = _on_surface(cloud, points_uv[0], zoom)[None].astype(np.float32)
+    opacities = ((RHO * zoom <= RADIUS_LIMITS[1]) & _on_surface(cloud, points_uv[0], zoom))[None].astype(np.float32)
     inverse = 1 / np.maximum(z[0], np.float32(1e-3))
     features = np.concatenate([cloud.colour, inverse[:, None], cloud.step_xyz], axis=1)[None]
     image, coverage = vestcl.splat(points_uv, z, radii, opacities, features, height, width)
@@ -102,12 +103,14 @@ def _on_surface(cloud: Cloud, points_uv: NDArray[np.float32], zoom: NDArray[np.f
     rows, columns = cloud.rows + 1, cloud.columns + 1
     places = np.full((2, rows.max(initial=0) + 2, columns.max(initial=0) + 2), np.nan, np.float32)
     places[:, rows, columns] = points_uv.T
-    count = np.zeros(len(rows), np.int32)
-    reach = np.square(_TORN * np.maximum(zoom, np.float32(1)))
-    for down, right in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
-        beside = places[:, rows + down, columns + right]
-        count += np.square(beside - points_uv.T).sum(0) < reach * (down * down + right * right)
-    return count >= _NEIGHBOURS
+    beside = [
+        np.square(places[:, rows + down, columns + right] - points_uv.T).sum(0) / (down * down + right * right)
+        for down, right in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
+    ]
+    limit = np.square(np.maximum(zoom, np.float32(1)))
+    count = (np.stack(beside) < _TORN**2 * limit).sum(0)
+    line = np.stack([np.maximum(one, other) for one, other in zip(beside[:4], beside[:3:-1], strict=True)])
+    return (count >= _NEIGHBOURS) | (line < _LINE**2 * limit).any(0)
 
 
 def rendered(shown: Shown, image: NDArray[np.float32]) -> Rendered:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import _check
-from vestcl.scene.correspondence import Correspondence
+from vestcl.scene.correspondence import Correspondence, check_size
 
 #: Every which pixel, both ways, takes part: neighbours of a dense flow say the same.
 _STRIDE: Final = 4
@@ -63,6 +63,7 @@ def ego_motion(
     depth = _check.depth("depth", depth)
     mask = _check.mask("mask", mask, depth)
     K = _check.matrix("K", K, 3)
+    check_size("correspondence", correspondence, depth)
     points_xyz, points_uv = _pairs(depth, mask, correspondence, K, far)
     if len(points_xyz) < _FEWEST:
         return EgoMotion(np.eye(4), 0.0)

@@ -31,7 +31,8 @@ def fill_holes(
         return image
     far = (inverse_depth + np.float32(_FAR)) ** -2 * np.float32(_FAR**2)
     planes = np.ascontiguousarray(np.where(hole, np.float32(0), image).transpose(1, 2, 0))
-    inside, outside = (_pull(planes, np.where(hole[0], np.float32(0), weight)) for weight in (far[0], np.ones_like(far[0])))
+    known = (np.where(hole[0], np.float32(0), weight) for weight in (far[0], np.ones_like(far[0])))
+    inside, outside = (_pull(planes, weight)[0] for weight in known)
     filled = np.where(_at_border(hole[0])[..., None], outside, inside).transpose(2, 0, 1)
     return np.where(hole, filled, image)
 
@@ -43,15 +44,24 @@ def _at_border(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(np.isin(labels, border[border > 0]))
 
 
-def _pull(image: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[H, W, C] with every pixel of weight 0 filled."""
+def _pull(image: NDArray[np.float32], weight: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """[H, W, C] with every pixel of weight 0 filled, and the weights [H, W] with theirs."""
     height, width = weight.shape
+    given = weight[..., None] > 0
     if min(height, width) < 2 or (weight > 0).all():
         mean = (image * weight[..., None]).sum((0, 1)) / max(float(weight.sum()), 1e-20)
-        return np.where(weight[..., None] > 0, image, mean.astype(np.float32))
+        return np.where(given, image, mean.astype(np.float32)), np.where(weight > 0, weight, weight.mean())
     size = (-(-width // 2), -(-height // 2))
     share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
-    total = cv2.resize(image * weight[..., None], size, interpolation=cv2.INTER_AREA).reshape(*share.shape, -1)
+    total = _resized(image * weight[..., None], size, cv2.INTER_AREA)
     mean = np.divide(total, share[..., None], out=np.zeros_like(total), where=share[..., None] > 0)
-    coarse = cv2.resize(_pull(mean, share), (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.where(weight[..., None] > 0, image, coarse.reshape(height, width, -1))
+    coarse, heavy = _pull(mean, share)
+    spread = cv2.resize(heavy, (width, height), interpolation=cv2.INTER_LINEAR)
+    drawn = _resized(coarse * heavy[..., None], (width, height), cv2.INTER_LINEAR)
+    filled = drawn / np.maximum(spread, np.float32(1e-20))[..., None]
+    return np.where(given, image, filled), np.where(weight > 0, weight, spread)
+
+
+def _resized(planes: NDArray[np.float32], size: tuple[int, int], interpolation: int) -> NDArray[np.float32]:
+    """[H, W, C] at ``size`` (width, height), of any number of channels."""
+    return np.stack([cv2.resize(plane, size, interpolation=interpolation) for plane in np.moveaxis(planes, -1, 0)], -1)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import _check
-from vestcl.scene.correspondence import Correspondence
+from vestcl.scene.correspondence import Correspondence, check_size
 from vestcl.scene.parallax import moved_pixels
 
 #: Forward-backward error beyond which flow is not believed, px.
@@ -20,6 +20,10 @@ _MOVES, _MOVES_SHARE = 2.0, 0.15
 #: Holes and specks up to that share of the picture's width are closed and dropped, and so are regions of less than
 #: that share of its pixels: a pedestrian at 25 m has 0.1 %.
 _BRUSH, _SMALLEST = 0.006, 0.0008
+
+#: A region is road, and no thing on it, if more than that share of it lies flat: its normal is so close to the vertical.
+#: What seems to move there is a line whose flow slides along it, a reflection or a shadow.
+_ROAD, _FLAT = 0.7, 0.8
 
 
 def motion_mask(
@@ -43,12 +47,14 @@ def motion_mask(
     """
     depth = _check.depth("depth", depth)
     dst_from_src = _check.matrix("dst_from_src", dst_from_src, 4)
-    rigid = rigid_pixels(depth, _check.matrix("K", K, 3), dst_from_src)
+    check_size("correspondence", correspondence, depth)
+    K = _check.matrix("K", K, 3)
+    rigid = rigid_pixels(depth, K, dst_from_src)
     still = np.hypot(*(rigid - moved_pixels(np.zeros_like(correspondence.flow_uv))))
     off = np.hypot(*(moved_pixels(correspondence.flow_uv) - rigid))
     believed = (depth[0] > 0) & (correspondence.error[0] < _FLOW_ERROR)
     moves = believed & (off > _MOVES + _MOVES_SHARE * still)
-    return ~_regions(moves)[None]
+    return ~_regions(moves, _lies_flat(depth[0], K))[None]
 
 
 def rigid_pixels(
@@ -63,13 +69,24 @@ def rigid_pixels(
     return q[:2] / np.maximum(q[2], 1e-6)
 
 
-def _regions(moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """``moves`` [H, W] without specks, its holes closed."""
+def _lies_flat(depth: NDArray[np.float32], K: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Where the surface [H, W] is horizontal: of a plane n . x = 1, 1/z = n . K^-1 p, the gradient of 1/z tells n."""
+    inverse = cv2.blur(np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0), (5, 5))
+    right, down = cv2.Sobel(inverse, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(inverse, cv2.CV_32F, 0, 1, scale=1 / 8)
+    y, x = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
+    normal_x, normal_y = K[0, 0] * right, K[1, 1] * down
+    normal_z = inverse - (x - K[0, 2]) * right - (y - K[1, 2]) * down
+    return np.abs(normal_y) > _FLAT * np.sqrt(normal_x**2 + normal_y**2 + normal_z**2)
+
+
+def _regions(moves: NDArray[np.bool_], flat: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """``moves`` [H, W] without specks and without road, its holes closed."""
     side = max(3, 2 * round(_BRUSH * moves.shape[1] / 2) + 1)
     brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     opened = cv2.morphologyEx(moves.astype(np.uint8), cv2.MORPH_OPEN, brush)
     closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, brush, iterations=2)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    large = stats[:, cv2.CC_STAT_AREA] >= _SMALLEST * moves.size
-    large[0] = False
-    return large[labels]
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    area = stats[:, cv2.CC_STAT_AREA]
+    things = (area >= _SMALLEST * moves.size) & (np.bincount(labels[flat], minlength=count) <= _ROAD * area)
+    things[0] = False
+    return things[labels]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import _check
-from vestcl.scene.correspondence import Correspondence
+from vestcl.scene.correspondence import Correspondence, check_size
 
 #: Standard deviation of dense inverse search where its flow returns, px (0.2 and 0.35 serve equally well).
 _FLOW_STD: Final = 0.25
@@ -71,6 +71,10 @@ def refine_depth(
     K = _check.matrix("K", K, 3)
     if not inverse_std > 0:
         raise ValueError(f"`inverse_std` must be above 0, got {inverse_std}")
+    for view in views:
+        check_size("views", view.correspondence, depth)
+    if not views:
+        return depth
     known = depth > 0
     given = np.divide(1, depth, out=np.zeros_like(depth), where=known)
     weight = np.where(known, np.float32(inverse_std**-2), np.float32(0))
@@ -85,7 +89,7 @@ def refine_depth(
         weight += np.where(use, precision / _FLOW_STD**2, 0)
         refuted |= known & static & (view.correspondence.error < _FLOW_ERROR) & ~(trusted & agrees)
     inverse = np.divide(total, weight, out=np.zeros_like(depth), where=(weight > 0) & ~refuted)
-    inverse = _without_islands(inverse)
+    inverse = np.where(static, _without_islands(inverse), inverse)  # what moves may well be small
     return np.divide(1, inverse, out=np.zeros_like(depth), where=inverse > 0)
 
 
@@ -129,6 +133,6 @@ def _epipolar(
 
 def _without_islands(inverse: NDArray[np.float32]) -> NDArray[np.float32]:
     """Small regions that stick out of their surroundings become 0."""
-    steps = (inverse[0] / _INVERSE_STEP).round().clip(0, 32767).astype(np.int16)
+    steps = np.where(inverse[0] > 0, (inverse[0] / _INVERSE_STEP).round() + 1, 0).clip(0, 32767).astype(np.int16)
     cv2.filterSpeckles(steps, 0, _ISLAND, round(_ISLAND_STEP / _INVERSE_STEP))
     return np.where(steps[None] > 0, inverse, np.float32(0))

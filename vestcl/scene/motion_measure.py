@@ -1,0 +1,137 @@
+"""Inverse depth of every pixel, as flow to several earlier pictures shows it while the camera moves."""
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vestcl.scene.correspondence import Correspondence
+from vestcl.scene.motion_pose import Pose
+from vestcl.scene.parallax import moved_pixels
+
+#: Forward-backward error, and distance to the epipolar line, beyond which flow says nothing of depth, px.
+_FLOW_ERROR, _OFF_LINE = 1.0, 1.0
+
+#: Error of the flow along the line, px: a constant, and a share of the flow, as long flow is found less well.
+_FLOW_STD, _FLOW_SHARE = 0.3, 0.015
+
+#: Noise of a picture, grey levels (0 to 1), over a window of so many pixels a side in which flow is found: where the
+#: brightness hardly changes along the epipolar line, on bare asphalt, flow finds whatever the noise and the smoothing
+#: of flow make of it.
+_GREY_STD, _WINDOW = 0.03, 9
+
+#: Views whose inverse depths differ by more standard deviations than that don't see the same thing.
+_AGREE: Final = 3.0
+
+#: Pixels that compare the lengths of two motions: those that moved along their lines by more px, in both.
+_MOVED: Final = 2.0
+
+#: Fewer pixels than that compare nothing.
+_FEWEST: Final = 200
+
+#: A pose that fewer of the correspondences agree with is not believed.
+_INLIERS: Final = 0.3
+
+Array = NDArray[np.float64]
+
+
+class Measured(NamedTuple):
+    """What flow tells, in units of the reference motion's length."""
+
+    inverse: Array
+    """[H, W] 1/unit, may be below 0 where nothing static can be."""
+    std: Array
+    """[H, W] 1/unit; infinite where nothing was measured."""
+    moving: NDArray[np.bool_]
+    """[H, W], True where reliable flow leads off the epipolar line, or behind infinity."""
+    lengths: list[float]
+    """Per view the length of its translation in units; 0 where it only turned or is not believed."""
+
+
+def measure(
+    image: NDArray[np.float32], correspondences: Sequence[Correspondence], poses: Sequence[Pose], K: Array
+) -> Measured | None:
+    """s = argmin |p' x (K R K^-1 p + s K t)|^2 for each view, in closed form; the views' weighted mean.
+
+    The first view with a translation sets the unit of length; each other one is scaled by the median ratio of its
+    inverse depths to the reference's. A view that disagrees with the first one that sees the pixel is left out there.
+
+    Args:
+        image: [3, H, W] RGB in [0, 1].
+        correspondences: from the picture to each earlier one, the latest first.
+        poses: of the same.
+        K: [3, 3] px.
+
+    Returns:
+        The measurement; None if no view has a translation.
+    """
+    lengths = [0.0] * len(poses)
+    reference: tuple[Array, Array] | None = None
+    moving = np.zeros(correspondences[0].flow_uv.shape[1:], bool)
+    texture = _texture(image)
+    total, weight = np.zeros(moving.shape), np.zeros(moving.shape)
+    for index, (correspondence, pose) in enumerate(zip(correspondences, poses, strict=True)):
+        if not pose.dst_from_src[:3, 3].any() or pose.inliers < _INLIERS:
+            continue
+        inverse, std, off = _triangulate(correspondence, pose.dst_from_src, K, texture)
+        if reference is None:
+            reference, lengths[index], moving = (inverse, std), 1.0, off
+        else:
+            lengths[index] = _ratio(reference, (inverse, std))
+            if not lengths[index]:
+                continue
+            inverse, std = inverse / lengths[index], std / lengths[index]
+        mean = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)
+        spread = np.sqrt(std**2 + 1 / np.maximum(weight, 1e-12))
+        use = np.isfinite(std) & ((weight == 0) | (np.abs(inverse - mean) < _AGREE * spread))
+        precision = np.where(use, std**-2.0, 0.0)
+        total, weight = total + precision * np.where(use, inverse, 0.0), weight + precision
+    if reference is None:
+        return None
+    known = weight > 0
+    mean = np.divide(total, weight, out=np.zeros_like(total), where=known)
+    std = np.where(known, np.maximum(weight, 1e-12) ** -0.5, np.inf)
+    return Measured(mean, std, moving | (known & (mean < -_AGREE * std)), lengths)
+
+
+def _texture(image: NDArray[np.float32]) -> Array:
+    """Sums of products of the picture's derivatives over a window, xx, yy and xy: [3, H, W]."""
+    grey = cv2.GaussianBlur(cv2.cvtColor(image.transpose(1, 2, 0), cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
+    x, y = (cv2.Sobel(grey, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1)))
+    products = [cv2.boxFilter(product, -1, (_WINDOW, _WINDOW), normalize=False) for product in (x * x, y * y, x * y)]
+    return np.stack(products).astype(np.float64)
+
+
+def _triangulate(
+    correspondence: Correspondence, motion: Array, K: Array, texture: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Inverse depth [H, W] in units of the motion's length, its standard deviation, and what is off its line."""
+    flow, error = correspondence
+    moved = moved_pixels(flow)
+    start = moved_pixels(np.zeros_like(flow))
+    rays = np.concatenate([start, np.ones_like(start[:1])])
+    a = np.tensordot(K @ motion[:3, :3] @ np.linalg.inv(K), rays, 1)
+    b = (K @ motion[:3, 3])[:, None, None]
+    constant, slope = a[:2] - moved * a[2], b[:2] - moved * b[2]
+    steepness = np.maximum((slope**2).sum(0), 1e-9)
+    inverse = -(constant * slope).sum(0) / steepness
+    z = np.maximum(a[2] + inverse * b[2], 1e-3)
+    off = np.abs(constant[0] * slope[1] - constant[1] * slope[0]) / np.sqrt(steepness) / z
+    noise = np.hypot(_FLOW_STD, _FLOW_SHARE * np.hypot(*flow)) + error[0].clip(max=_FLOW_ERROR) / 2
+    contrast = (slope**2 * texture[:2]).sum(0) + 2 * slope[0] * slope[1] * texture[2]
+    noise = np.hypot(noise, _GREY_STD * np.sqrt(steepness / np.maximum(contrast, 1e-12)))
+    returns = (error[0] < _FLOW_ERROR) & (noise < _FLOW_ERROR)
+    std = np.where(returns & (off < _OFF_LINE), noise * z / np.sqrt(steepness), np.inf)
+    return inverse, std, returns & (off > 2 * _OFF_LINE)
+
+
+def _ratio(reference: tuple[Array, Array], other: tuple[Array, Array]) -> float:
+    """Median of other over reference where both are sure; 0 where too few are."""
+    sure = np.ones(reference[0].shape, bool)
+    for inverse, std in (reference, other):
+        sure &= inverse * _FLOW_STD > _MOVED * std
+    if sure.sum() < _FEWEST:
+        return 0.0
+    return float(np.median(other[0][sure] / reference[0][sure]))
