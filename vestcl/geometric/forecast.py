@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
-from vestcl.scene.holes import fill_holes
-from vestcl.geometric.perception import Perception, Seen
+from vestcl.geometric.perception import Perception
 from vestcl.geometric.render import Cloud, holes, rendered, show
 from vestcl.scene.ego_motion import constant_velocity
+from vestcl.scene.holes import fill_holes
 
 #: Of so many last motions the mean is extrapolated: two are smoother than one, and still follow a bend.
 _MOTIONS: Final = 2
@@ -87,7 +87,7 @@ def forecast_frames(
     if len(cameras) < steps:
         raise ValueError(f"`future_from_cur` must be of {steps} steps or more, got {len(cameras)}")
     clouds = _clouds(perception, index)
-    start, frames = time.perf_counter(), []
+    start, frames = time.perf_counter(), list[dict[str, Rendered]]()
     for step in range(1, steps + 1):
         moved = [cloud(step, [np.eye(4), *cameras]) for cloud in clouds]
         frames.append({})
@@ -101,7 +101,8 @@ def forecast_frames(
 def _extrapolate(perception: Perception, index: int, steps: int) -> list[NDArray[np.float64]]:
     """future_from_cur for each step."""
     seen = range(max(index - _MOTIONS + 1, 1), index + 1)
-    motion = constant_velocity([np.linalg.inv(perception.prev_from_cur(i)) for i in seen])
+    motions = [np.asarray(np.linalg.inv(perception.prev_from_cur(i)), np.float64) for i in seen]
+    motion = constant_velocity(motions)
     return [np.linalg.matrix_power(motion, step) for step in range(1, steps + 1)]
 
 
@@ -113,7 +114,7 @@ def _clouds(perception: Perception, index: int) -> list[MovingCloud]:
     """What the current frame shows; what the one before did; what is behind the current foreground."""
     K = perception.clip[index].K
     cur, prev = perception.seen(index), perception.seen(index - 1)
-    cur_from_prev = np.linalg.inv(perception.prev_from_cur(index))
+    cur_from_prev = np.asarray(np.linalg.inv(perception.prev_from_cur(index)), np.float64)
     everything = np.ones_like(cur.layers.mask)
     shown = _cloud(cur.layers.image, cur.layers.depth, everything, K, cur.velocity, cur.own)
     before = _cloud(prev.layers.image, prev.layers.depth, ~prev.own, K, prev.velocity, None, cur_from_prev)

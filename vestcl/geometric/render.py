@@ -18,9 +18,9 @@ RADIUS_LIMITS: Final = (0.5, 8.0)
 _OPAQUE: Final = 0.5
 
 #: Pixels that were next to each other belong to one surface if the view shows them no farther apart than that, times
-#: what it magnifies; and a surface is where a pixel has so many of its eight neighbours, or two on a line: a pole of one pixel has one above
-#: and one below, no farther apart than `_LINE`. The rest is spray: pixels at edges whose depth lies between that of the
-#: near and the far side.
+#: what it magnifies; and a surface is where a pixel has so many of its eight neighbours, or two on a line: a pole of one
+#: pixel has one above and one below, no farther apart than `_LINE`. The rest is spray: pixels at edges whose depth lies
+#: between that of the near and the far side.
 _TORN, _NEIGHBOURS, _LINE = 2.5, 3, 1.1
 
 #: Less coverage than that is a hole.
@@ -78,7 +78,8 @@ def show(
         planes += left * opacity * image / np.maximum(coverage, np.float32(1e-6))
         left = left * (1 - opacity)
         uncovered = uncovered * (1 - coverage)
-    return Shown(planes / np.maximum(1 - left, np.float32(1e-6)), 1 - uncovered)
+    shown = planes / np.maximum(1 - left, np.float32(1e-6))
+    return Shown(shown.astype(np.float32), (1 - uncovered).astype(np.float32))
 
 
 def _splat(

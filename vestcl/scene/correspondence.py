@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from vestcl import baselines
 from vestcl.scene import _check
 
-
-#: Error of flow where the picture's gradient is 1 a pixel, in pixels: bare asphalt (0.0025 a pixel on a motorway) and sky
-#: (0.002) get more than a pixel, grass and rough asphalt (0.02 on KITTI) 0.2.
+#: Error of flow where the picture's gradient is 1 a pixel, in pixels: bare asphalt (0.0025 a pixel on a motorway) and
+#: sky (0.002) get more than a pixel, grass and rough asphalt (0.02 on KITTI) 0.2.
 _NOISE: Final = 0.003
 
 #: Gradients are averaged over about the size of a patch of dense inverse search, px.

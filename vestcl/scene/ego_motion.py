@@ -80,8 +80,9 @@ def ego_motion(
     if not found or inliers is None or len(inliers) < max(_FEWEST, _INLIERS * len(points_xyz)):
         return EgoMotion(np.eye(4), 0.0)
     agree = inliers[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(points_xyz[agree], points_uv[agree], K, None, turn, shift)
-    return EgoMotion(rigid(turn[:, 0], shift[:, 0]), len(agree) / len(points_xyz))
+    refined = cv2.solvePnPRefineLM(points_xyz[agree], points_uv[agree], K, None, turn, shift)
+    turn, shift = (np.asarray(vector, np.float64)[:, 0] for vector in refined)
+    return EgoMotion(rigid(turn, shift), len(agree) / len(points_xyz))
 
 
 def _pairs(

@@ -32,9 +32,15 @@ def fill_holes(
     far = (inverse_depth + np.float32(_FAR)) ** -2 * np.float32(_FAR**2)
     planes = np.ascontiguousarray(np.where(hole, np.float32(0), image).transpose(1, 2, 0))
     known = (np.where(hole[0], np.float32(0), weight) for weight in (far[0], np.ones_like(far[0])))
-    inside, outside = (_pull(planes, weight)[0] for weight in known)
+    inside, outside = (_pull(planes, weight.astype(np.float32))[0] for weight in known)
     filled = np.where(_at_border(hole[0])[..., None], outside, inside).transpose(2, 0, 1)
     return np.where(hole, filled, image)
+
+
+def push_pull(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """``image`` [C, H, W] with what is not ``known`` [H, W] filled from all sides alike; all 0 if nothing is known."""
+    planes = np.ascontiguousarray(np.where(known, image, np.float32(0)).transpose(1, 2, 0))
+    return np.where(known, image, _pull(planes, known.astype(np.float32))[0].transpose(2, 0, 1))
 
 
 def _at_border(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -52,7 +58,7 @@ def _pull(image: NDArray[np.float32], weight: NDArray[np.float32]) -> tuple[NDAr
         mean = (image * weight[..., None]).sum((0, 1)) / max(float(weight.sum()), 1e-20)
         return np.where(given, image, mean.astype(np.float32)), np.where(weight > 0, weight, weight.mean())
     size = (-(-width // 2), -(-height // 2))
-    share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+    share = np.asarray(cv2.resize(weight, size, interpolation=cv2.INTER_AREA), np.float32)
     total = _resized(image * weight[..., None], size, cv2.INTER_AREA)
     mean = np.divide(total, share[..., None], out=np.zeros_like(total), where=share[..., None] > 0)
     coarse, heavy = _pull(mean, share)

@@ -7,16 +7,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import _check
-from vestcl.scene._inpaint_methods import Inpainter, inpainter, push_pull
+from vestcl.scene.inpainters import Inpainter, inpainter
+from vestcl.scene.structure import structure_behind
+
+#: How colour is filled if nothing else is asked for. `vestcl bench inpaint` chose it: see README.
+DEFAULT: Final = "regions"
 
 #: By how much what an object hides is farther than the object, at least (SPEC section 3.3).
 _BEHIND: Final = np.float32(1.01)
 
-#: Width of the pictures of which the SPEC's 10 px are told (SPEC section 10).
-_WIDTH: Final = 832
+#: The SPEC's dilation, px, and the width of the pictures that it is told of.
+_DILATE, _WIDTH = 10, 832
 
-#: The SPEC's dilation, px.
-_DILATE: Final = 10
+#: Nothing hidden is farther, metres.
+_FARTHEST: Final = 10_000.0
 
 
 def inpaint_background(
@@ -27,17 +31,46 @@ def inpaint_background(
     dilate: int | None = None,
     method: str | Inpainter | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """I_bg and D_bg."""
+    """I_bg and D_bg: the frame where M = 1; where M = 0 what surrounds the foreground, dilated, goes on behind it.
+
+    Depth: D_bg = max(1 / max(road, wall), 1.01 D), see `structure_behind`. Colour: by ``method``.
+
+    Args:
+        image: [3, H, W] RGB in [0, 1].
+        depth: [1, H, W] m, above 0 everywhere.
+        mask: M [1, H, W] bool, True = static background.
+        dilate: px by which the hole grows, lest the rim of the foreground is taken for background; None is 10 px at
+            832 columns, and in proportion.
+        method: a name of `inpainters.METHODS`, "lama:PATH", a function as `Inpainter`; None is DEFAULT.
+
+    Returns:
+        [3, H, W] and [1, H, W] m; the arguments themselves where nothing is hidden. A picture that is all foreground
+        has nothing to go by: it keeps its colour, at 1.01 D.
+
+    Raises:
+        ValueError: shapes, dtypes, numbers that aren't finite, zero depth, an unknown method.
+    """
     depth = _check.depth("depth", depth)
     image = _check.planes("image", image, 3, depth)
     mask = _check.mask("mask", mask, depth)
+    if not depth.all():
+        raise ValueError(f"`depth` must be above 0 m everywhere, got {int((depth == 0).sum())} pixels of 0")
+    fill = inpainter(DEFAULT if method is None else method)
     if mask.all():
         return image, depth
-    radius = round(_DILATE * depth.shape[2] / _WIDTH) if dilate is None else dilate
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    hole = cv2.dilate((~mask[0]).view(np.uint8), kernel).view(bool)[None]
-    fill = inpainter("push-pull") if method is None else inpainter(method)
-    colour = np.where(mask, image, fill(image, hole))
-    inverse = push_pull(1 / depth, hole)
-    behind = np.maximum(1 / np.maximum(inverse, 1e-6), _BEHIND * depth)
-    return colour, np.where(mask, depth, behind)
+    hole = _dilated(mask, round(_DILATE * depth.shape[2] / _WIDTH) if dilate is None else dilate)
+    if hole.all():
+        hole = ~mask
+    if hole.all():
+        return image, _BEHIND * depth
+    behind = structure_behind(np.reciprocal(depth), hole)
+    colour = np.where(mask, image, fill(image, hole, behind.road)).astype(np.float32)
+    hidden = np.maximum(1 / np.maximum(behind.inverse, np.float32(1 / _FARTHEST)), _BEHIND * depth)
+    return colour, np.where(mask, depth, hidden)
+
+
+def _dilated(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+    if radius < 0:
+        raise ValueError(f"`dilate` must be 0 px or more, got {radius}")
+    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return cv2.dilate((~mask[0]).astype(np.uint8), brush).astype(bool)[None]

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import _check
 from vestcl.scene.completion import complete_depth
-from vestcl.scene.inpaint import Inpainter, inpaint_background
+from vestcl.scene.inpaint import inpaint_background
+from vestcl.scene.inpainters import Inpainter
 
 #: Depth of the sky, metres: so far that driving 5 m on shifts it by less than half a pixel of a 1242 pixels wide
 #: picture, so that in effect it only turns (SPEC section 3.5).

@@ -21,7 +21,7 @@ _MOVES, _MOVES_SHARE = 2.0, 0.15
 #: that share of its pixels: a pedestrian at 25 m has 0.1 %.
 _BRUSH, _SMALLEST = 0.006, 0.0008
 
-#: A region is road, and no thing on it, if more than that share of it lies flat: its normal is so close to the vertical.
+#: A region is road, and no thing on it, if more than that share of it lies flat: its normal is that close to vertical.
 #: What seems to move there is a line whose flow slides along it, a reflection or a shadow.
 _ROAD, _FLAT = 0.7, 0.8
 
