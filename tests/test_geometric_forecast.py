@@ -253,8 +253,9 @@ def test_refuses(change: dict[str, Any], message: str) -> None:
         forecast_frames(perception(*PLAIN), **arguments)
 
 
-def test_refuses_a_clip_without_depth() -> None:
+def test_a_plain_video_beats_repeating_its_last_frame() -> None:
     clip = perception(*PLAIN).clip
-    flat = replace(clip, samples=tuple(replace(s, depth=None, right=None) for s in clip))
-    with pytest.raises(ValueError, match="neither depth nor a right camera"):
-        forecast_clip(flat, NOW, 1, [LEFT])
+    flat = replace(clip, samples=tuple(replace(s, depth=None, right=None, labels=None) for s in clip))
+    shown = forecast_clip(flat, NOW, 1, [LEFT]).frames[0][LEFT.name].image
+    truth, last = clip[NOW + 1].read_image(), clip[NOW].read_image()
+    assert np.square(shown - truth).mean() < 0.5 * np.square(last - truth).mean()

@@ -204,10 +204,19 @@ def test_seconds_add_up_to_what_it_took() -> None:
 # ---------------------------------------------------------------- what can't be seen
 
 
-def test_no_depth_and_no_second_camera() -> None:
+def test_no_depth_and_no_second_camera_takes_motion() -> None:
     clip = without(drive(4).clip, "depth", "right")
-    with pytest.raises(ValueError, match="street 4: has neither depth nor a right camera"):
-        Perception(clip).raw_depth(FRAME)
+    depth, truth = Perception(clip).raw_depth(FRAME), drive(4).clip[FRAME].read_depth()
+    near = truth < 40
+    assert (depth > 0).all() and np.median(np.abs(depth / truth - 1)[near]) < 0.25
+    assert Perception(clip).prev_from_cur(FRAME)[2, 3] > 0.3  # the frame before was behind
+    assert Perception(clip).raw_depth(0).shape == depth.shape
+
+
+def test_one_frame_alone_has_no_depth() -> None:
+    clip = without(drive(4).clip, "depth", "right")[:1]
+    with pytest.raises(ValueError, match="needs two frames, a right camera or depth, got one frame alone"):
+        Perception(clip).raw_depth(0)
 
 
 def test_the_first_frame_has_none_before_it() -> None:

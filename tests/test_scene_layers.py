@@ -71,7 +71,7 @@ def test_sky_from_the_depth_where_none_is_given() -> None:
 def test_the_inpainter_that_is_asked_for() -> None:
     red = np.array([1, 0, 0], np.float32)[:, None, None]
 
-    def paint(colour: NDArray[np.float32], hole: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def paint(colour: NDArray[np.float32], hole: NDArray[np.bool_], road: NDArray[np.bool_]) -> NDArray[np.float32]:
         return np.where(hole, red, colour)
 
     given = frame()

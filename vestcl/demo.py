@@ -1,9 +1,11 @@
 """`vestcl demo`: the whole job on a procedural street, whose future can be seen from any camera.
 
-What a car with two cameras would have is all that the forecast gets: the stereo pairs up to now, and their calibration.
+What a car with two cameras would have is all that the forecast gets: the stereo pairs up to now, their calibration, and
+classes of the pixels, as a segmentation network tells them.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -33,7 +35,7 @@ START: Final = 0.7
 SAMPLES: Final = 2
 
 #: The source camera, the rig's right one, and one that no car has: beside it, higher up, turned to the left.
-VIEWS: Final = ("source", "right", "1.2,-0.4,0.5,yaw=-6,name=beside")
+VIEWS: Final = ("source", "right", "0.6,-0.3,0,yaw=-4,name=beside")
 
 #: Steps that the sheet shows.
 SHOWN: Final = (1, 3, 5)
@@ -73,7 +75,7 @@ def run(out: Path, height: int, width: int, seed: int, steps: int = 5) -> None:
 
 
 def stereo_only(clip: Clip) -> Clip:
-    """The clip as a car's two cameras record it: without depth, classes and poses."""
+    """The clip as a car's two cameras record it, with classes: without depth and poses."""
     bare = (dataclasses.replace(sample, depth=None, world_from_cam=None) for sample in clip)
     return dataclasses.replace(clip, samples=tuple(bare))
 
@@ -93,10 +95,10 @@ def _scores(
 ) -> dict[str, list[dict[str, float]]]:
     """method -> step -> metric. What the baselines know of another view is the source's."""
     pair = [torch.from_numpy(clip[at].read_image())[None] for at in (index - 1, index)]
-    images = {
+    images: dict[str, Sequence[Image]] = {
         "forecast": [frame[view.name].image for frame in forecast.frames],
-        "repeat last": baselines.repeat_last(pair[0], pair[1], len(truth))[0].numpy(),
-        "optical flow": baselines.flow_extrapolation(pair[0], pair[1], len(truth))[0].numpy(),
+        "repeat last": list(baselines.repeat_last(pair[0], pair[1], len(truth))[0].numpy()),
+        "optical flow": list(baselines.flow_extrapolation(pair[0], pair[1], len(truth))[0].numpy()),
     }
     return {
         method: [_score(image, wanted) for image, wanted in zip(of_method, truth, strict=True)]
@@ -116,14 +118,18 @@ def _sheet(perception: Perception, index: int, forecast: Forecast, truth: dict[s
     before, now = (sheet.rgb(perception.image(at)) for at in (index - 1, index))
     depth = sheet.depth_map(layers.depth)
     rows = [[Cell(before, "seen, t-1"), Cell(now, "seen, t"), Cell(depth, "depth at t, from stereo and motion")]]
-    for name, title in (("source", "the same camera"), ("beside", "1.2 m to the right, turned left")):
+    for name, title in (("source", "the same camera"), ("beside", "0.6 m to the right, 0.3 m higher, turned left")):
         for step in (step for step in SHOWN if step <= len(forecast.frames)):
             shown, wanted = forecast.frames[step - 1][name].image, truth[name][step - 1]
             error = np.abs(shown - wanted).mean(axis=0, keepdims=True)
             label = f"t+{step}, {title}: {_score(shown, wanted)['psnr']:.1f} dB"
-            rows.append([Cell(sheet.rgb(shown), label), Cell(sheet.rgb(wanted), "truth"), Cell(sheet.heat(error), "error")])
+            rows.append(
+                [Cell(sheet.rgb(shown), label), Cell(sheet.rgb(wanted), "truth"), Cell(sheet.heat(error), "error")]
+            )
     scale = ("error: 0", f"{sheet.WORST_ERROR} of the range and more")
-    return sheet.sheet(rows, title="a street forecast from stereo pairs, without any trained weights", bar=scale)
+    return sheet.sheet(
+        rows, title="a street forecast from stereo pairs and class masks, without any trained weights", bar=scale
+    )
 
 
 def _score_table(scores: dict[str, dict[str, list[dict[str, float]]]]) -> Table:

@@ -18,9 +18,9 @@ RADIUS_LIMITS: Final = (0.5, 8.0)
 _OPAQUE: Final = 0.5
 
 #: Pixels that were next to each other belong to one surface if the view shows them no farther apart than that, times
-#: what it magnifies; and a surface is where a pixel has so many of its eight neighbours, or two on a line: a pole of one
-#: pixel has one above and one below, no farther apart than `_LINE`. The rest is spray: pixels at edges whose depth lies
-#: between that of the near and the far side.
+#: what it magnifies; and a surface is where a pixel has so many of its eight neighbours, or two on a line: a pole of
+#: one pixel has one above and one below, no farther apart than `_LINE`. The rest is spray: pixels at edges whose depth
+#: lies between that of the near and the far side.
 _TORN, _NEIGHBOURS, _LINE = 2.5, 3, 1.1
 
 #: Less coverage than that is a hole.
@@ -91,27 +91,38 @@ def _splat(
         cloud.points_xyz[None], still, K[None].astype(np.float32), tgt_from_next[None].astype(np.float32)
     )
     zoom = cloud.z_src / np.maximum(z[0], np.float32(1e-3))
-    radii = np.clip(RHO * zoom, *RADIUS_LIMITS)[None]
-    opacities = ((RHO * zoom <= RADIUS_LIMITS[1]) & _on_surface(cloud, points_uv[0], zoom))[None].astype(np.float32)
+    whole, stretch = _surface(cloud, points_uv[0], zoom)
+    radii = np.clip(RHO * stretch, *RADIUS_LIMITS)[None]
+    opacities = (whole & (RHO * zoom <= RADIUS_LIMITS[1]))[None].astype(np.float32)
     inverse = 1 / np.maximum(z[0], np.float32(1e-3))
     features = np.concatenate([cloud.colour, inverse[:, None], cloud.step_xyz], axis=1)[None]
     image, coverage = vestcl.splat(points_uv, z, radii, opacities, features, height, width)
     return np.ascontiguousarray(image[0]), coverage[0]
 
 
-def _on_surface(cloud: Cloud, points_uv: NDArray[np.float32], zoom: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which points [N] still have neighbours of their picture beside them."""
+def _surface(
+    cloud: Cloud, points_uv: NDArray[np.float32], zoom: NDArray[np.float32]
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Which points [N] still have neighbours of their picture beside them, and how far apart those are [N], px.
+
+    A surface that turns towards the camera is stretched by more than what it comes nearer by: spacing >= ``zoom``.
+    """
     rows, columns = cloud.rows + 1, cloud.columns + 1
     places = np.full((2, rows.max(initial=0) + 2, columns.max(initial=0) + 2), np.nan, np.float32)
     places[:, rows, columns] = points_uv.T
+    steps = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
     beside = [
         np.square(places[:, rows + down, columns + right] - points_uv.T).sum(0) / (down * down + right * right)
-        for down, right in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
+        for down, right in steps
     ]
     limit = np.square(np.maximum(zoom, np.float32(1)))
     count = (np.stack(beside) < _TORN**2 * limit).sum(0)
     line = np.stack([np.maximum(one, other) for one, other in zip(beside[:4], beside[:3:-1], strict=True)])
-    return (count >= _NEIGHBOURS) | (line < _LINE**2 * limit).any(0)
+    whole = (count >= _NEIGHBOURS) | (line < _LINE**2 * limit).any(0)
+    above, left, right, below = (beside[steps.index(step)] for step in ((-1, 0), (0, -1), (0, 1), (1, 0)))
+    spacing = np.stack([np.fmin(above, below), np.fmin(left, right)])
+    spacing = np.where(spacing < _TORN**2 * limit, spacing, 0).max(0)
+    return whole, np.maximum(zoom, np.sqrt(spacing)).astype(np.float32)
 
 
 def rendered(shown: Shown, image: NDArray[np.float32]) -> Rendered:

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 #: Surroundings count by 1 / (1/z + that)^2, 1/m: what was hidden is likelier to go on behind a hole than what hid it.
 _FAR: Final = 0.01
 
+#: Holes up to that share of the picture's width across are cracks.
+_CRACK: Final = 0.006
+
 
 def fill_holes(
     image: NDArray[np.float32], inverse_depth: NDArray[np.float32], hole: NDArray[np.bool_]
@@ -41,6 +44,14 @@ def push_pull(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[n
     """``image`` [C, H, W] with what is not ``known`` [H, W] filled from all sides alike; all 0 if nothing is known."""
     planes = np.ascontiguousarray(np.where(known, image, np.float32(0)).transpose(1, 2, 0))
     return np.where(known, image, _pull(planes, known.astype(np.float32))[0].transpose(2, 0, 1))
+
+
+def deep_holes(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """What remains of ``hole`` [1, H, W] without cracks, and without holes that reach the picture's border."""
+    side = 2 * round(_CRACK * hole.shape[2] / 2) + 1
+    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    wide = cv2.morphologyEx(hole[0].astype(np.uint8), cv2.MORPH_OPEN, brush).astype(bool)
+    return (wide & ~_at_border(hole[0]))[None]
 
 
 def _at_border(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -71,8 +71,8 @@ def _ransac(rays: Array, s: Array, spread: Array) -> Array:
     """The level plane through three points that most points are on."""
     rng = np.random.default_rng(0)
     triples = rng.integers(0, len(s), (_ROUNDS, 3))
-    corners = rays[triples] + 1e-9 * np.eye(3)  # three points on a line stay solvable, and are not level
-    planes: Array = np.asarray(np.linalg.solve(corners, s[triples][..., None])[..., 0], np.float64)
+    # By the pseudo-inverse, which three points on a line have, too; what it gives for them is voted down.
+    planes: Array = np.asarray((np.linalg.pinv(rays[triples]) @ s[triples][..., None])[..., 0], np.float64)
     counts = (np.abs(planes @ rays.T - s) < _INLIER * spread).sum(1) * is_level(planes)
     return np.asarray(planes[counts.argmax()])
 
