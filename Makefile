@@ -12,7 +12,7 @@ venv: .venv/.installed
 .venv/.installed: setup.py constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --constraint constraints.txt setuptools torch
-	$(BIN)/python -m pip install --constraint constraints.txt --no-build-isolation --editable '.[dev]'
+	$(BIN)/python -m pip install --constraint constraints.txt --no-build-isolation --editable '.[dev,estimators]'
 	touch $@
 
 demo: venv
@@ -28,6 +28,9 @@ test: lint
 
 bench: venv
 	$(BIN)/vestcl bench splat
+	$(BIN)/vestcl bench inpaint
+	$(BIN)/vestcl bench network
+	$(BIN)/vestcl bench forecast street:
 
 # The operators' tests on every OpenCL device of this machine instead of the default one.
 devices-test: venv

@@ -1,4 +1,4 @@
-"""Where frames come from: the procedural street, and later one reader a data set."""
+"""Where frames come from: the procedural street, and one reader a data set, which `open.open_sequence` chooses."""
 
 from vestcl.data.raycast import SKY_DEPTH, Frame, Label
 from vestcl.data.street import Street, intrinsics

@@ -48,7 +48,7 @@ def structure_behind(inverse: NDArray[np.float32], hole: NDArray[np.bool_]) -> S
     road = np.zeros((height, width)) if plane is None else np.tensordot(plane, rays_of(K, height, width), 1)
     wall = _wall(inverse[0], hole[0])
     behind = np.where(hole[0], np.maximum(road, wall), inverse[0]).astype(np.float32)
-    on_road = np.where(hole[0], road >= wall, np.abs(inverse[0] - road) < _ON_ROAD * road)
+    on_road = np.where(hole[0], (1 + _ON_ROAD) * road >= wall, np.abs(inverse[0] - road) < _ON_ROAD * road)
     return Structure(behind[None], on_road[None])
 
 
