@@ -128,6 +128,19 @@ def edge_with_spray() -> tuple[Floats, Floats]:
     return image, depth
 
 
+def test_no_cracks_in_a_wall_that_turns_towards_the_camera() -> None:
+    """A wall along the road, 2 m to the right: from 2 m further left its columns are twice as far apart, no nearer."""
+    ray = np.broadcast_to((np.arange(WIDTH) + 0.5 - K[0, 2]) / K[0, 0], (HEIGHT, WIDTH))
+    wall = (ray > 0.1) & (ray < 0.4)
+    depth = np.where(wall, 2 / np.maximum(ray, 0.1), 1000).astype(np.float32)[None]
+    covered = (
+        seen(cloud_of(colour((1, 1, 1)), depth, which=wall), tgt_from_next=pose(xyz=(2.0, 0.0, 0.0))).coverage[0] > 0.5
+    )
+    rows = covered[HEIGHT // 2 - 10 : HEIGHT // 2 + 10]
+    first, last = rows.any(0).nonzero()[0][[0, -1]]
+    assert last - first > 0.5 * K[0, 0] and rows[:, first + 2 : last - 1].all()
+
+
 def test_spray_is_suppressed() -> None:
     """The camera steps 0.7 m to the left, the box 20 px further than the wall: of the red, little is left between."""
     shown = seen(cloud_of(*edge_with_spray()), tgt_from_next=pose(xyz=(0.7, 0, 0)))

@@ -61,6 +61,17 @@ def test_still_pictures() -> None:
     assert np.abs(found.flow_uv).max() < SUBPIXEL and np.median(found.error) < SUBPIXEL
 
 
+def test_flow_is_doubted_where_the_picture_has_no_texture_or_only_a_line() -> None:
+    """Blank, a vertical edge and noise, side by side: only the last one holds flow in both directions."""
+    image = np.full((3, HEIGHT, WIDTH), 0.5, np.float32)
+    image[:, :, 150:] = 0.8  # an edge along the columns
+    image[:, :, 220:] = noise()[:, :, 220:]
+    error = correspond(image, image).error[0]
+    middle = np.s_[20:-20]
+    assert error[middle, 50:100].min() > 10 and error[middle, 148:152].min() > 1
+    assert np.median(error[middle, 250:]) < SUBPIXEL
+
+
 def test_same_bits_twice() -> None:
     pair = shifted(3, 1)
     for first, second in zip(correspond(*pair), correspond(*pair), strict=True):

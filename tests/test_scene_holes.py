@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vestcl.scene.holes import fill_holes
+from vestcl.scene.holes import deep_holes, fill_holes
 
 HEIGHT, WIDTH = 45, 64
 
@@ -82,6 +82,28 @@ def test_any_size(height: int, width: int) -> None:
     image, hole = np.full((3, height, width), 0.25, np.float32), np.ones((1, height, width), bool)
     hole[:, -1, -1] = False
     np.testing.assert_allclose(fill_holes(image, np.ones((1, height, width), np.float32), hole), 0.25, atol=1e-5)
+
+
+def test_deep_holes_are_wide_and_inside() -> None:
+    hole = np.zeros((1, 100, 400), bool)
+    hole[0, 40:60, 100:130] = True  # wide
+    hole[0, 20:80, 200:202] = True  # a crack: 0.006 of 400 columns
+    hole[0, 30:70, 380:] = True  # at the border
+    deep = deep_holes(hole)
+    assert deep[0, 45:55, 105:125].all() and not deep[0, :, 150:].any() and not (deep & ~hole).any()
+
+
+def test_a_hole_at_the_border_is_filled_from_all_sides_alike() -> None:
+    """Near below and far above, as in the tests above, but the hole reaches the picture's edge."""
+    image = np.zeros((1, 64, 64), np.float32)
+    image[:, 32:] = 1
+    inverse = np.where(image > 0, np.float32(0.5), np.float32(0.01))
+    inside, border = np.zeros((2, 1, 64, 64), bool)
+    inside[0, 24:40, 20:40], border[0, 24:40, :20] = True, True
+    at = np.s_[0, 28:36]
+    far = float((fill_holes(image, inverse, inside)[at][:, 20:40] < 0.5).mean())
+    alike = float((fill_holes(image, inverse, border)[at][:, :20] < 0.5).mean())
+    assert far > 0.9 and 0.3 < alike < 0.7
 
 
 def test_same_bits_twice() -> None:

@@ -77,6 +77,20 @@ def test_empty_streets_as_they_are_seen() -> None:
     assert np.mean(shares) < 0.03
 
 
+def test_what_seems_to_move_on_the_road_is_no_thing() -> None:
+    """The same wrong flow, on a road and on a wall that stands on it."""
+    focal, down = K[1, 1], np.arange(HEIGHT)[:, None] + 0.5 - K[1, 2]
+    road = np.minimum(focal * 1.5 / np.maximum(down, 1), 40).astype(np.float32)
+    for depth, found in (
+        (np.broadcast_to(road, (HEIGHT, WIDTH)), False),
+        (np.full((HEIGHT, WIDTH), 9, np.float32), True),
+    ):
+        depth = np.ascontiguousarray(depth)[None]
+        correspondence = exact_flow(depth, FORWARD)
+        correspondence.flow_uv[:, 65:90, 100:200] += 12
+        assert (~motion_mask(depth, correspondence, FORWARD, K)).any() == found
+
+
 def test_rigid_pixels_are_the_projection_of_what_moved() -> None:
     x, y, z = move(FORWARD, points(room()))
     wanted = np.stack([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]])
