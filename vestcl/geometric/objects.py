@@ -40,8 +40,8 @@ _PIXELS: Final = 3000
 #: Residual flow beyond so many pixels is no motion but a wrong match, and below so many it is noise.
 _LARGEST, _NOISE = 40.0, 0.2
 
-#: Up to that share of believed flow around a pixel no background is corrected, from that one on all: bare asphalt has
-#: little, and would heave. Things always follow: on kitti_clip that is worth 0.4 dB at t+1.
+#: Up to that share of believed flow around a pixel nothing is corrected, from that one on everything: bare asphalt has
+#: little, and would heave.
 _WEAK, _STRONG = 0.15, 0.35
 
 #: Gauss-Newton rounds.
@@ -128,7 +128,6 @@ def velocities(
 
 def follow_flow(
     velocity: NDArray[np.float32],
-    things: NDArray[np.int32],
     image: NDArray[np.float32],
     depth: NDArray[np.float32],
     correspondence: Correspondence,
@@ -143,7 +142,6 @@ def follow_flow(
 
     Args:
         velocity: [3, H, W] m a frame.
-        things: [H, W], from `segment`.
         image: [3, H, W] RGB in [0, 1].
         depth: [1, H, W] m, above 0; the sky keeps its velocity.
         correspondence: from t to t - 1.
@@ -166,7 +164,7 @@ def follow_flow(
     planes = [smooth(guide, np.where(believed, share * plane, 0).astype(np.float32)) / weight for plane in residual]
     shrunk = np.stack(planes) * np.maximum(0, 1 - _NOISE**2 / np.maximum((np.stack(planes) ** 2).sum(0), 1e-9))
     focal = np.array([K[0, 0], K[1, 1]])[:, None, None]
-    trust = np.where(things > 0, 1, ((weight - _WEAK) / (_STRONG - _WEAK)).clip(0, 1)) * (depth[0] < SKY_DEPTH)
+    trust = ((weight - _WEAK) / (_STRONG - _WEAK)).clip(0, 1) * (depth[0] < SKY_DEPTH)
     corrected = velocity.copy()
     corrected[:2] -= (trust * shrunk * there[2] / focal).astype(np.float32)
     return corrected

@@ -176,5 +176,5 @@ class Perception:
             motion = self.correspondence(index), self.prev_from_cur(index), sample.K
             by_thing = objects.velocities(things, *measured, *motion)
             velocity = by_thing.astype(np.float32)[things].transpose(2, 0, 1)
-            velocity = objects.follow_flow(velocity, things, layers.image, layers.depth, *motion)
+            velocity = objects.follow_flow(velocity, layers.image, layers.depth, *motion)
         return Seen(layers, things, velocity, own)
