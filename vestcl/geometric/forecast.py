@@ -140,6 +140,7 @@ def _cloud(
     if cur_from_src is not None:  # a frame interval ago
         points = _transform(cur_from_src, points + speed)
         speed = speed @ cur_from_src[:3, :3].T
+    z_src, colour = z.astype(np.float32), image[:, y, x].T
     rides = np.zeros((len(x), 1), bool) if own is None else own[0, y, x][:, None]
 
     def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
@@ -147,7 +148,7 @@ def _cloud(
             np.where(rides, points, _transform(future_from_cur[k], points + k * speed)) for k in (step, step - 1)
         )
         step_xyz = (there - before).astype(np.float32)
-        return Cloud(there.astype(np.float32), z.astype(np.float32), image[:, y, x].T, step_xyz, y, x)
+        return Cloud(there.astype(np.float32), z_src, colour, step_xyz, y, x)
 
     return at
 
@@ -164,8 +165,10 @@ def _render(clouds: list[Cloud], K: NDArray[np.float64], view: View, clip: Clip)
     """
     height, width = clip[0].height, clip[0].width
     seen = show(clouds[:-1], K, view.tgt_from_next, height, width)
-    behind = show(clouds[-1:], K, view.tgt_from_next, height, width)
-    deep = deep_holes(holes(seen)) & ~holes(behind)
-    shown = Shown(np.where(deep, behind.planes, seen.planes), seen.coverage)
-    hole = holes(seen) & ~deep
+    shown, hole = seen, holes(seen)
+    deep = deep_holes(hole)
+    if deep.any():
+        behind = show(clouds[-1:], K, view.tgt_from_next, height, width)
+        deep &= ~holes(behind)
+        shown, hole = Shown(np.where(deep, behind.planes, seen.planes), seen.coverage), hole & ~deep
     return rendered(shown, fill_holes(shown.planes[:3], shown.planes[3:4], hole))

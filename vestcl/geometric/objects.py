@@ -10,6 +10,7 @@ from vestcl.scene import _check
 from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import Correspondence, sample
 from vestcl.scene.layers import SKY_DEPTH
+from vestcl.scene.motion_plane import rays_of
 from vestcl.scene.parallax import moved_pixels
 
 #: Neighbours whose depths differ by a larger factor belong to different things.
@@ -152,17 +153,16 @@ def follow_flow(
         [3, H, W] m a frame.
     """
     height, width = depth.shape[1:]
-    y, x = np.mgrid[:height, :width]
-    rays = np.tensordot(np.linalg.inv(K), np.stack([x + 0.5, y + 0.5, np.ones(depth.shape[1:])]), 1)
-    points = (rays * depth - velocity).reshape(3, -1)
+    points = (rays_of(K, height, width) * depth - velocity).reshape(3, -1)
     there = (prev_from_cur[:3, :3] @ points + prev_from_cur[:3, 3:]).reshape(3, height, width)
     q = np.tensordot(K, there, 1)
     residual = moved_pixels(correspondence.flow_uv) - q[:2] / np.maximum(q[2], 0.1)
     believed = (depth[0] < SKY_DEPTH) & (q[2] > 0.1) & (np.hypot(*residual) < _LARGEST)
     guide, share = _check.pixels(image), (believed / (1 + correspondence.error[0] ** 4)).astype(np.float32)
     weight = np.maximum(smooth(guide, share), np.float32(1e-6))
-    planes = [smooth(guide, np.where(believed, share * plane, 0).astype(np.float32)) / weight for plane in residual]
-    shrunk = np.stack(planes) * np.maximum(0, 1 - _NOISE**2 / np.maximum((np.stack(planes) ** 2).sum(0), 1e-9))
+    planes = (np.where(believed, share * plane, 0).astype(np.float32) for plane in residual)
+    spread = np.stack([smooth(guide, plane) / weight for plane in planes])
+    shrunk = spread * np.maximum(0, 1 - _NOISE**2 / np.maximum((spread**2).sum(0), 1e-9))
     focal = np.array([K[0, 0], K[1, 1]])[:, None, None]
     trust = ((weight - _WEAK) / (_STRONG - _WEAK)).clip(0, 1) * (depth[0] < SKY_DEPTH)
     corrected = velocity.copy()

@@ -8,9 +8,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import _check
 
-#: Strength of the smoother, how much it minds edges of the image (of 255), its damping and rounds. From 20 to 1000 in
-#: strength the forecast on KITTI odometry loses 1.5 dB at t+1; 2 to 8 in edges makes no difference.
-_LAMBDA, _SIGMA, _DAMPING, _ROUNDS = 20.0, 4.0, 0.25, 3
+#: Strength of the smoother and how much it minds edges of the image (of 255). From 20 to 1000 in strength the forecast
+#: on KITTI odometry loses 1.5 dB at t+1; 2 to 8 in edges makes no difference.
+_STRENGTH, _EDGES = 20.0, 4.0
+
+#: Its damping from round to round, and its rounds: OpenCV's own.
+_DAMPING, _ROUNDS = 0.25, 3
 
 #: Nothing is set farther than that for want of anything better, metres.
 _FAR: Final = 500.0
@@ -45,9 +48,11 @@ def complete_depth(depth: ArrayLike, image: ArrayLike) -> NDArray[np.float32]:
     return np.where(known, depth, 1 / np.maximum(spread, np.float32(1 / _FAR)))
 
 
-def smooth(guide: NDArray[np.uint8], plane: NDArray[np.float32]) -> NDArray[np.float32]:
+def smooth(
+    guide: NDArray[np.uint8], plane: NDArray[np.float32], strength: float = _STRENGTH, edges: float = _EDGES
+) -> NDArray[np.float32]:
     """G: ``plane`` [H, W] smoothed up to the edges of ``guide`` [H, W, 3]."""
     filtered = cv2.ximgproc.fastGlobalSmootherFilter(
-        guide, plane, _LAMBDA, _SIGMA, lambda_attenuation=_DAMPING, num_iter=_ROUNDS
+        guide, plane, strength, edges, lambda_attenuation=_DAMPING, num_iter=_ROUNDS
     )
     return np.asarray(filtered, np.float32)

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene import _check
+from vestcl.scene import _check, completion
+from vestcl.scene.motion_mask import without_specks
 
 #: Off the road: by more standard deviations than that, and by more than that share of the road's inverse depth.
 _OFF, _OFF_SHARE = 3.0, 0.25
@@ -18,9 +19,8 @@ _PLANE, _PLANE_FAR, _UNSEEN = 0.04, 0.001, 0.02
 #: Nearer than that, 1/m, the plane is road: beyond, hills and bends end it.
 _ROAD_END: Final = 1 / 120
 
-#: Holes and specks of moving things up to that share of the picture's width are closed and dropped, and so are
-#: regions of less than that share of its pixels.
-_BRUSH, _SMALLEST = 0.006, 0.0006
+#: Regions of moving things of less than that share of the picture's pixels are dropped.
+_SMALLEST: Final = 0.0006
 
 #: A region that fills that share of its convex hull is taken to be one thing, a car, with holes in its flow.
 _SOLID: Final = 0.6
@@ -35,9 +35,9 @@ _TALL, _WAIST, _VEILED_BELOW = 0.45, 0.5, 0.008
 #: A measurement counts half if its standard deviation is that share of itself plus so many 1/m.
 _HALF_SHARE, _HALF = 0.15, 0.002
 
-#: Strength of the smoother, how much it minds edges of the image (of 255), its damping and rounds. From 600 to 3000 in
-#: strength the next frame of KITTI odometry, warped by depth and motion, loses 0.2 dB.
-_LAMBDA, _SIGMA, _DAMPING, _ROUNDS = 600.0, 5.0, 0.25, 3
+#: Strength of the smoother and how much it minds edges of the image (of 255). From 600 to 3000 in strength the next
+#: frame of KITTI odometry, warped by depth and motion, loses 0.2 dB.
+_STRENGTH, _EDGES = 600.0, 5.0
 
 #: Nothing but the sky is farther, m.
 FAR: Final = 500.0
@@ -68,11 +68,7 @@ def standing(inverse: Array, std: Array, moving: NDArray[np.bool_], road: Array)
         road: [H, W] 1/m of the plane, below 0 above its horizon.
     """
     found = (_behind(inverse, std, road) | moving) & (road > _ROAD_END)
-    side = max(3, 2 * round(_BRUSH * inverse.shape[1] / 2) + 1)
-    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, brush)
-    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, brush, iterations=2)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(without_specks(found), connectivity=8)
     feet, things, veiled = [0.0], np.zeros(labels.shape, np.int32), np.zeros(labels.shape, bool)
     for label in range(1, count):
         x, y, width, height, area = stats[label]
@@ -140,12 +136,6 @@ def smooth(inverse: Array, confidence: Array, road: Array, image: NDArray[np.flo
     """
     guide, ground = _check.pixels(image), np.maximum(road, 0)
     weight = np.maximum(confidence, 1e-4)
-    total, share = (_spread(guide, plane.astype(np.float32)) for plane in (weight * (inverse - ground), weight))
+    planes = weight * (inverse - ground), weight
+    total, share = (completion.smooth(guide, plane.astype(np.float32), _STRENGTH, _EDGES) for plane in planes)
     return np.asarray(ground + total / np.maximum(share, 1e-9), np.float64)
-
-
-def _spread(guide: NDArray[np.uint8], plane: NDArray[np.float32]) -> NDArray[np.float32]:
-    filtered = cv2.ximgproc.fastGlobalSmootherFilter(
-        guide, plane, _LAMBDA, _SIGMA, lambda_attenuation=_DAMPING, num_iter=_ROUNDS
-    )
-    return np.asarray(filtered, np.float32)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import _check
 from vestcl.scene.correspondence import Correspondence, check_size
-from vestcl.scene.parallax import moved_pixels
+from vestcl.scene.parallax import epipolar, moved_pixels, pixel_centres
 
 #: Forward-backward error beyond which flow is not believed, px.
 _FLOW_ERROR: Final = 1.0
@@ -50,7 +50,7 @@ def motion_mask(
     check_size("correspondence", correspondence, depth)
     K = _check.matrix("K", K, 3)
     rigid = rigid_pixels(depth, K, dst_from_src)
-    still = np.hypot(*(rigid - moved_pixels(np.zeros_like(correspondence.flow_uv))))
+    still = np.hypot(*(rigid - pixel_centres(*depth.shape[1:])))
     off = np.hypot(*(moved_pixels(correspondence.flow_uv) - rigid))
     believed = (depth[0] > 0) & (correspondence.error[0] < _FLOW_ERROR)
     moves = believed & (off > _MOVES + _MOVES_SHARE * still)
@@ -61,11 +61,9 @@ def rigid_pixels(
     depth: NDArray[np.float32], K: NDArray[np.float64], dst_from_src: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Where a static scene of ``depth`` [1, H, W] is seen from dst: [2, H, W] px; invalid depth counts as infinite."""
-    pixels = moved_pixels(np.zeros((2, *depth.shape[1:]), np.float32))
-    homogeneous = np.concatenate([pixels, np.ones_like(pixels[:1])])
+    start, slope = epipolar(K, dst_from_src, *depth.shape[1:])
     inverse = np.divide(1, depth[0], out=np.zeros_like(depth[0]), where=depth[0] > 0)
-    turned = np.tensordot(K @ dst_from_src[:3, :3] @ np.linalg.inv(K), homogeneous, 1)
-    q = turned + inverse * (K @ dst_from_src[:3, 3])[:, None, None]
+    q = start + inverse * slope[:, None, None]
     return q[:2] / np.maximum(q[2], 1e-6)
 
 
@@ -79,13 +77,17 @@ def _lies_flat(depth: NDArray[np.float32], K: NDArray[np.float64]) -> NDArray[np
     return np.abs(normal_y) > _FLAT * np.sqrt(normal_x**2 + normal_y**2 + normal_z**2)
 
 
-def _regions(moves: NDArray[np.bool_], flat: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """``moves`` [H, W] without specks and without road, its holes closed."""
-    side = max(3, 2 * round(_BRUSH * moves.shape[1] / 2) + 1)
+def without_specks(found: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """``found`` [H, W] as 0 and 1, without specks, its holes closed."""
+    side = max(3, 2 * round(_BRUSH * found.shape[1] / 2) + 1)
     brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    opened = cv2.morphologyEx(moves.astype(np.uint8), cv2.MORPH_OPEN, brush)
-    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, brush, iterations=2)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, brush)
+    return np.asarray(cv2.morphologyEx(opened, cv2.MORPH_CLOSE, brush, iterations=2), np.uint8)
+
+
+def _regions(moves: NDArray[np.bool_], flat: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The regions of ``moves`` [H, W] that are large, and no road."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(without_specks(moves), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA]
     things = (area >= _SMALLEST * moves.size) & (np.bincount(labels[flat], minlength=count) <= _ROAD * area)
     things[0] = False

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vestcl.scene.correspondence import Correspondence
 from vestcl.scene.motion_pose import Pose
-from vestcl.scene.parallax import moved_pixels
+from vestcl.scene.parallax import epipolar, moved_pixels
 
 #: Forward-backward error, and distance to the epipolar line, beyond which flow says nothing of depth, px.
 _FLOW_ERROR, _OFF_LINE = 1.0, 1.0
@@ -110,10 +110,8 @@ def _triangulate(
     """Inverse depth [H, W] in units of the motion's length, its standard deviation, and what is off its line."""
     flow, error = correspondence
     moved = moved_pixels(flow)
-    start = moved_pixels(np.zeros_like(flow))
-    rays = np.concatenate([start, np.ones_like(start[:1])])
-    a = np.tensordot(K @ motion[:3, :3] @ np.linalg.inv(K), rays, 1)
-    b = (K @ motion[:3, 3])[:, None, None]
+    a, b = epipolar(K, motion, *flow.shape[1:])
+    b = b[:, None, None]
     constant, slope = a[:2] - moved * a[2], b[:2] - moved * b[2]
     steepness = np.maximum((slope**2).sum(0), 1e-9)
     inverse = -(constant * slope).sum(0) / steepness

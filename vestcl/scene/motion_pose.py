@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from vestcl.scene.correspondence import Correspondence
 from vestcl.scene.ego_motion import rigid
-from vestcl.scene.parallax import moved_pixels
+from vestcl.scene.parallax import moved_pixels, pixel_centres
 
 #: Every which pixel, both ways, takes part: neighbours of a dense flow say the same.
 _STRIDE: Final = 6
@@ -80,7 +80,7 @@ def relative_pose(correspondence: Correspondence, K: Array) -> Pose:
 def _pairs(correspondence: Correspondence) -> tuple[Array, Array]:
     """[N, 2] px in src and dst."""
     moved = moved_pixels(correspondence.flow_uv)
-    start = moved_pixels(np.zeros_like(correspondence.flow_uv))
+    start = pixel_centres(*correspondence.flow_uv.shape[1:])
     grid = np.s_[:, _STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE]
     believed = correspondence.error[grid][0] < _FLOW_ERROR
     return start[grid][:, believed].T.copy(), moved[grid][:, believed].T.copy()

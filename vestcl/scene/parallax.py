@@ -99,7 +99,7 @@ def _measure(
     """Inverse depth [1, H, W] by the flow alone, |dp'/ds|^2 (px m)^2, and whether the flow keeps to its line."""
     flow, error = view.correspondence
     moved = moved_pixels(flow)
-    start, slope = _epipolar(K, view.dst_from_src, flow.shape[1:])
+    start, slope = epipolar(K, view.dst_from_src, *flow.shape[1:])
     inverse = given[0].astype(np.float64)
     for turn in range(2):  # where nothing is given, the first turn only finds where to linearise
         q = start + inverse * slope[:, None, None]
@@ -115,18 +115,23 @@ def _measure(
     return measured[None].astype(np.float32), precision[None].astype(np.float32), trusted[None]
 
 
+def pixel_centres(height: int, width: int) -> NDArray[np.float64]:
+    """p [2, H, W] px, x then y."""
+    y, x = np.mgrid[:height, :width]
+    return np.stack([x + 0.5, y + 0.5])
+
+
 def moved_pixels(flow_uv: NDArray[np.float32]) -> NDArray[np.float64]:
     """p + flow(p) [2, H, W] px at pixel centres."""
-    y, x = np.mgrid[: flow_uv.shape[1], : flow_uv.shape[2]]
-    return np.stack([x + 0.5, y + 0.5]) + flow_uv
+    return pixel_centres(*flow_uv.shape[1:]) + flow_uv
 
 
-def _epipolar(
-    K: NDArray[np.float64], dst_from_src: NDArray[np.float64], size: tuple[int, ...]
+def epipolar(
+    K: NDArray[np.float64], dst_from_src: NDArray[np.float64], height: int, width: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """a = K R K^-1 p [3, H, W] and b = K t [3]: p' is a + s b, divided by its third."""
-    y, x = np.mgrid[: size[0], : size[1]]
-    pixels = np.stack([x + 0.5, y + 0.5, np.ones(size)])
+    """a = K R K^-1 p [3, H, W] and b = K t [3]: at inverse depth s, p is seen at p' = a + s b, divided by its third."""
+    centres = pixel_centres(height, width)
+    pixels = np.concatenate([centres, np.ones_like(centres[:1])])
     homography = K @ dst_from_src[:3, :3] @ np.linalg.inv(K)
     return np.tensordot(homography, pixels, 1), K @ dst_from_src[:3, 3]
 
