@@ -171,3 +171,25 @@ def test_a_real_drive() -> None:
 def test_refuses(trajectory: np.ndarray, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Street.generate(0, trajectory)
+
+
+def test_drawn_driving_is_forwards_varied_and_in_its_lane() -> None:
+    drives = [Sway.drawn(np.random.default_rng(seed)) for seed in range(40)]
+    t = np.arange(0, 60, 0.1)
+    numbers = np.stack([drive.at(t) for drive in drives])
+    steps = np.diff(numbers[..., 0], axis=1)
+    assert steps.min() >= 0
+    assert np.ptp([drive.speed for drive in drives]) > 8
+    assert np.abs(numbers[..., 1]).max() < 0.6  # the room beside a car
+    rates = np.degrees(np.diff(numbers[..., 3], axis=1)).std(axis=1)
+    assert rates.max() > 4 * rates.min()
+
+
+def test_drawn_speed_is_the_slope_of_its_way() -> None:
+    drive = Sway(9.0, 1.3, amplitude=2.0, pace=1.5)
+    t = np.arange(0, 300, 0.001)
+    slope = np.gradient(drive.travelled(t), t)
+    yaw_free = np.gradient(drive.at(t)[:, 1], t) / slope
+    assert np.corrcoef(np.arctan(yaw_free), drive.at(t)[:, 3])[0, 1] > 0.7
+    assert slope.mean() == pytest.approx(9.0, abs=0.1)
+    assert 1.5 < np.abs(slope - 9.0).max() / np.abs(np.gradient(Sway(9.0, 1.3).travelled(t), t) - 9.0).max() < 2.2

@@ -43,6 +43,15 @@ PITCH_WAVES: Final[tuple[Wave, ...]] = (
 )
 ROLL_WAVES: Final[tuple[Wave, ...]] = ((np.radians(0.18), 0.33), (np.radians(0.16), 0.53), (np.radians(0.09), 1.17))
 
+#: What `Sway.drawn` draws from: mean speeds in towns, m/s; wobble from half of KITTI's calmer drive to its wilder one's
+#: (see above), and as much faster or slower.
+SPEEDS: Final = (2.0, 15.0)
+AMPLITUDES: Final = (0.3, 2.0)
+PACES: Final = (0.6, 1.5)
+
+#: The speed waves' sum, m/s, rounded up: an amplitude below speed / MAX_CHANGE never drives backwards.
+MAX_CHANGE: Final = 3.2
+
 
 def _wave(waves: tuple[Wave, ...], phase: float, t: Array) -> Array:
     """Sum of a sin(2 pi f t + k phase), k counting from 1."""
@@ -63,18 +72,34 @@ class Sway:
     """Mean, metres a second."""
     phase: float
     """Radians; where all the waves are at time 0."""
+    amplitude: float = 1.0
+    """All waves times that."""
+    pace: float = 1.0
+    """All waves' frequencies times that."""
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> "Sway":
+        """Driving at random in the ranges of real cars in towns: what networks are trained on.
+
+        SPEEDS, AMPLITUDES and PACES are uniform; slow cars sway less, so that none drives backwards.
+        """
+        speed = rng.uniform(*SPEEDS)
+        amplitude = rng.uniform(AMPLITUDES[0], min(AMPLITUDES[1], speed / MAX_CHANGE))
+        return cls(speed, rng.uniform(0, 2 * np.pi), amplitude, rng.uniform(*PACES))
 
     def at(self, t: ArrayLike) -> Array:
         """[..., 6] at times ``t`` [...] in seconds; see the module."""
         t = np.asarray(t, np.float64)
-        speed = self.speed + _wave(SPEED_WAVES, self.phase, t)
+        phase, s, size = self.phase, self.pace * t, self.amplitude
+        speed = self.speed + size * _wave(SPEED_WAVES, phase, s)
+        aside = size * self.pace * _slope(LATERAL_WAVES, phase, s)
         numbers = (
             self.travelled(t),
-            _wave(LATERAL_WAVES, self.phase, t),
-            _wave(HEIGHT_WAVES, self.phase, t),
-            np.arctan2(_slope(LATERAL_WAVES, self.phase, t), speed) + _wave(YAW_WAVES, self.phase, t),
-            _wave(PITCH_WAVES, self.phase, t),
-            _wave(ROLL_WAVES, self.phase, t),
+            size * _wave(LATERAL_WAVES, phase, s),
+            size * _wave(HEIGHT_WAVES, phase, s),
+            np.arctan2(aside, speed) + size * _wave(YAW_WAVES, phase, s),
+            size * _wave(PITCH_WAVES, phase, s),
+            size * _wave(ROLL_WAVES, phase, s),
         )
         return np.stack(numbers, axis=-1)
 
@@ -82,7 +107,8 @@ class Sway:
         """Metres along the road at times ``t`` in seconds: speed t + the integral of the speed's waves."""
         t = np.asarray(t, np.float64)
         distance = self.speed * t
-        for k, (a, f) in enumerate(SPEED_WAVES, 1):
+        for k, (wave, hertz) in enumerate(SPEED_WAVES, 1):
+            a, f = self.amplitude * wave, self.pace * hertz
             distance += a / (2 * np.pi * f) * (np.cos(k * self.phase) - np.cos(2 * np.pi * f * t + k * self.phase))
         return distance
 
