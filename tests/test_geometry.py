@@ -51,6 +51,33 @@ def test_product_of_quaternions_is_the_product_of_rotations(first: torch.Tensor,
     torch.testing.assert_close(product, wanted, rtol=0, atol=1e-9)
 
 
+@given(quaternions)
+@settings(max_examples=100, deadline=None)
+def test_a_rotation_gives_its_quaternion_back(q: torch.Tensor) -> None:
+    unit = q / q.norm()
+    got = geometry.matrix_to_quaternion(geometry.quaternion_to_matrix(q))
+    assert float(got[0]) >= 0 and float(got.norm()) == pytest.approx(1, abs=1e-15)
+    assert min(float((got - unit).norm()), float((got + unit).norm())) < 1e-14
+
+
+@pytest.mark.parametrize("short_of_half_a_turn", [0.0, 1e-3, 1e-6, 1e-9, 1e-12])
+def test_quaternions_near_half_a_turn_keep_the_axis_and_the_angle(short_of_half_a_turn: float) -> None:
+    axes = torch.nn.functional.normalize(torch.randn(64, 3, dtype=torch.float64), dim=-1)
+    axes[:3] = torch.eye(3, dtype=torch.float64)
+    half = torch.tensor((math.pi - short_of_half_a_turn) / 2, dtype=torch.float64)
+    q = torch.cat([half.cos().expand(64, 1), half.sin() * axes], dim=-1)
+    got = geometry.matrix_to_quaternion(geometry.quaternion_to_matrix(q))
+    assert float(torch.minimum((got - q).norm(dim=-1), (got + q).norm(dim=-1)).max()) < 1e-14
+    assert got.shape == (64, 4) and (got[:, 0] >= 0).all()
+
+
+def test_quaternion_of_rest_and_of_a_quarter_turn_by_hand() -> None:
+    assert geometry.matrix_to_quaternion(torch.eye(3)).tolist() == [1, 0, 0, 0]
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)  # about z
+    half = math.sqrt(0.5)
+    torch.testing.assert_close(geometry.matrix_to_quaternion(quarter), torch.tensor([half, 0, 0, half]).double())
+
+
 @given(quaternions, vectors, vectors)
 @settings(max_examples=50, deadline=None)
 def test_inverse_brings_points_back(q: torch.Tensor, t: torch.Tensor, point: torch.Tensor) -> None:
@@ -96,5 +123,7 @@ def test_gradients() -> None:
         tensor.requires_grad_()
     assert gradcheck(lambda q, t, p: geometry.transform_points(geometry.compose_rigid(q, t), p), (q, t, points_xyz))
     assert gradcheck(lambda q, t: geometry.invert(geometry.compose_rigid(q, t)), (q, t))
+    rotations = geometry.quaternion_to_matrix(q.detach()).requires_grad_()
+    assert gradcheck(geometry.matrix_to_quaternion, (rotations,))
     assert gradcheck(geometry.quaternion_multiply, (q, q.detach().flip(0).requires_grad_()))
     assert gradcheck(lambda K: geometry.crop_intrinsics(geometry.scale_intrinsics(K, 0.5, 2), 3, 4), (K,))

@@ -29,6 +29,34 @@ def quaternion_to_matrix(quaternion: torch.Tensor) -> torch.Tensor:
     return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
 
 
+def matrix_to_quaternion(rotation: torch.Tensor) -> torch.Tensor:
+    """The unit quaternion q with R(q) = R and w >= 0: a row of 4 q q^T, which is linear in R, brought to length 1.
+
+    Of the four rows, 4 q_i q, the one with the largest q_i is taken: its length is 2 or more, so half turns, where
+    w = 0, are as exact as any.
+
+    Args:
+        rotation: [..., 3, 3], a rotation; not checked. float64 keeps an angle to 1e-16, float32 to 1e-7.
+
+    Returns:
+        [..., 4], (w, x, y, z); differentiable. `quaternion_to_matrix` undoes it.
+
+    Source: Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1978.
+    """
+    a, b, c, d, e, f, g, h, i = rotation.flatten(-2).unbind(-1)
+    entries = [
+        1 + a + e + i, h - f, c - g, d - b,
+        h - f, 1 + a - e - i, b + d, c + g,
+        c - g, b + d, 1 - a + e - i, f + h,
+        d - b, c + g, f + h, 1 - a - e + i,
+    ]  # fmt: skip
+    rows = torch.stack(entries, dim=-1).unflatten(-1, (4, 4))
+    largest = rows.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)[..., None, None].expand(*rows.shape[:-2], 1, 4)
+    row = rows.gather(-2, largest)[..., 0, :]
+    row = torch.where(row[..., :1] < 0, -row, row)
+    return row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
+
+
 def quaternion_multiply(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     """The Hamilton product: R(first second) = R(first) R(second), so ``second`` turns a vector before ``first`` does.
 
