@@ -1,0 +1,229 @@
+"""A clip's frames computed once: what each depends on, which are there already, and one process a clip at a time."""
+
+import contextlib
+import dataclasses
+import fcntl
+import functools
+import hashlib
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vestcl.data.sample import Clip, Sample
+from vestcl.geometric.perception import Perception
+from vestcl.io.atomic import read_bytes
+from vestcl.io.images import to_float, to_pixels
+from vestcl.io.video import Video
+from vestcl.prepared import prepare_frame
+from vestcl.prepared_files import JSON, RECIPE, frame_path, read_tensors, write_clip, write_frame
+
+#: Frames before it that perception looks at: depth from motion sees three, and the frame before has to have it, too.
+LOOKS_BACK: Final = 3
+
+#: Held by who writes to a clip's folder; the kernel lets go of it when the process ends, however it ends.
+_LOCK: Final = ".lock"
+
+#: What of a sample goes into a frame. Not its name, its time or its true pose, which clip.json has.
+_SEEN: Final = ("image", "K", "size", "depth", "labels", "ego_vehicle", "right")
+
+#: Bytes of a file that are hashed at once.
+_CHUNK: Final = 1 << 20
+
+#: Told of each frame: whether it was computed (True) or there already.
+Report = Callable[[bool], None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was done for a clip."""
+
+    computed: int
+    """Frames."""
+    kept: int
+    """Frames that were there, whole and of the same key."""
+    seconds: dict[str, float]
+    """By stage."""
+
+
+class EightBitPerception(Perception):
+    """Perception of the pictures as the cache holds them, so that nothing in a file is of a picture it lacks.
+
+    The right camera's are not rounded here: matching takes 8 bits of them anyway.
+    """
+
+    def image(self, index: int) -> NDArray[np.float32]:
+        """[3, H, W], rounded to 8 bits."""
+        return to_float(to_pixels(super().image(index)))
+
+
+def prepare_clip(
+    clip: Clip, folder: Path, *, estimators: str = "", wait: bool = True, report: Report = lambda computed: None
+) -> Outcome | None:
+    """Compute what is missing of a clip's cache; afterwards it is complete.
+
+    Files are replaced whole, so that it may be killed at any moment and goes on from there. Frames whose key is the
+    same and whose checksums are right are kept. Processes that prepare one clip at once do so one after the other.
+
+    Args:
+        clip: at the size wanted, two frames or more.
+        folder: for this clip alone.
+        estimators: what tells the networks apart that estimate depth or classes for the clip.
+        wait: for another process that is at this clip.
+        report: called after each frame.
+
+    Returns:
+        What was done, or None where another process is at this clip and ``wait`` is False.
+
+    Raises:
+        ValueError: a clip of one frame, a file of the clip that is missing or damaged, a folder that can't be written.
+        OSError: a frame can't be written: the disk is full. What is there stays.
+    """
+    if len(clip) < 2:
+        raise ValueError(f"{clip.name}: must have 2 frames or more, got 1: without a motion nothing is forecast")
+    with _locked(folder, wait) as ours:
+        return _complete(clip, folder, estimators, report) if ours else None
+
+
+def _complete(clip: Clip, folder: Path, estimators: str, report: Report) -> Outcome:
+    start = time.perf_counter()
+    keys = frame_keys(clip, estimators)
+    missing = {index for index, key in enumerate(keys) if not _is_there(folder, index, key)}
+    seconds = Counter({"check": time.perf_counter() - start})
+    if missing:
+        (folder / JSON).unlink(missing_ok=True)  # a clip of old and new frames is no clip
+    _tidy(folder, len(clip))
+    perception = EightBitPerception(clip)
+    for index, key in enumerate(keys):
+        if index in missing:
+            seconds.update(_write(perception, folder, index, key))
+        report(index in missing)
+    with _explained(folder / JSON):
+        write_clip(folder, clip, keys)
+    return Outcome(len(missing), len(clip) - len(missing), {**perception.seconds, **seconds})
+
+
+def _write(perception: Perception, folder: Path, index: int, key: str) -> dict[str, float]:
+    """Compute and write a frame; returns the seconds that this took beside perception."""
+    frame, camera = prepare_frame(perception, index), perception.clip[index].right
+    start = time.perf_counter()
+    right = None if camera is None else camera.read_image()
+    middle = time.perf_counter()
+    with _explained(frame_path(folder, index)):
+        write_frame(folder, index, key, frame, right)
+    return {"right": middle - start, "write": time.perf_counter() - middle}
+
+
+def _is_there(folder: Path, index: int, key: str) -> bool:
+    try:
+        read_tensors(folder, index, key)
+    except ValueError:  # missing, damaged or of something else: computed anew in each case
+        return False
+    return True
+
+
+def _tidy(folder: Path, frames: int) -> None:
+    """Remove what killed processes left half written, and frames that the clip has no more."""
+    wanted = {frame_path(folder, index) for index in range(frames)}
+    for path in folder.glob("*.safetensors"):  # hidden ones, too
+        if path not in wanted:
+            path.unlink()
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, wait: bool) -> Iterator[bool]:
+    """Yields whether this process alone may write to the folder."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / _LOCK).open("a")
+    except OSError as error:
+        raise ValueError(f"{folder}: can't be written ({error.strerror}); `--out` names another folder") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            yield False
+            return
+        yield True
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        why = f"{error.strerror}; what is prepared so far stays, and the same command goes on from there"
+        raise OSError(error.errno, f"can't be written: {why}", str(path)) from error
+
+
+# ---------------------------------------------------------------- keys
+
+
+def frame_keys(clip: Clip, estimators: str = "") -> list[str]:
+    """For each frame the SHA-256 of all that it is computed from: the frames that perception sees for it, and RECIPE.
+
+    Files count by their content, wherever they lie; a procedural street by its numbers.
+
+    Args:
+        clip: at the size wanted.
+        estimators: what tells the networks apart that estimate depth or classes.
+
+    Raises:
+        ValueError: a file is missing.
+    """
+    samples = [_sample_digest(sample) for sample in clip]
+    keys = []
+    for index in range(len(clip)):
+        # The first frame has none before it, so that its depth may be from its motion to the second.
+        seen = samples[:2] if index == 0 else samples[max(index - LOOKS_BACK, 0) : index + 1]
+        key = hashlib.sha256(f"{RECIPE}|{index == 0}|{estimators}".encode())
+        for digest in seen:
+            key.update(digest)
+        keys.append(key.hexdigest())
+    return keys
+
+
+def _sample_digest(sample: Sample) -> bytes:
+    digest = hashlib.sha256()
+    for name in _SEEN:
+        digest.update(name.encode())
+        _add(digest, getattr(sample, name))
+    return digest.digest()
+
+
+def _add(digest: Any, value: Any) -> None:
+    """What a value is, down to the content of files. Of an unknown object its class: caches are no part of a frame."""
+    digest.update(type(value).__qualname__.encode())
+    if isinstance(value, Path):
+        digest.update(hashlib.sha256(read_bytes(value)).digest())
+    elif isinstance(value, Video):
+        digest.update(_file_digest(value.path, *_version(value.path)))
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype}{value.shape}".encode())
+        digest.update(np.ascontiguousarray(value))
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            digest.update(field.name.encode())
+            _add(digest, getattr(value, field.name))
+    elif isinstance(value, bool | int | float | str | tuple | None):
+        digest.update(repr(value).encode())
+
+
+def _version(path: Path) -> tuple[int, int]:
+    about = path.stat()
+    return about.st_size, about.st_mtime_ns
+
+
+@functools.lru_cache(maxsize=1)
+def _file_digest(path: Path, size: int, changed: int) -> bytes:
+    """Of a file that many frames share."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+    return digest.digest()

@@ -1,0 +1,200 @@
+"""What `vestcl prepare` does: depth, masks, inpainting and motion of every frame of clips, once, into a cache."""
+
+import dataclasses
+import functools
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from vestcl.data.sample import Clip
+from vestcl.data.street import Street
+from vestcl.data.street_drive import Sway
+from vestcl.forecast_command import open_clip
+from vestcl.prepare_clip import Outcome, Report, prepare_clip
+from vestcl.prepare_workers import Task, Told, run_tasks
+
+if TYPE_CHECKING:
+    from vestcl import cli
+
+#: Inputs that are no files: procedural streets by their seeds.
+STREETS: Final = re.compile(r"street:(\d+)(?:-(\d+))?")
+
+#: Where a data set's cache is without ``out``: in it, or for a file beside it.
+BESIDE: Final = ".vestcl"
+
+#: With random driving, a street's clip starts somewhere in its first minute, so that all phases of its sway come up.
+STARTS: Final = (0.0, 60.0)
+
+#: Of the random numbers of a street: the driving, and the start.
+_DRIVE, _START = 1, 2
+
+#: Options of a clip's reader, as `vestcl forecast` has them, with what they are if not given.
+_READER: Final[Mapping[str, Any]] = {
+    **dict.fromkeys(("fov", "depth", "depth_scale", "labels", "depth_model", "mask_model")),
+    **dict.fromkeys(("rig", "sequence", "snippet", "variant")),
+    "label_ids": "trainIds",
+}
+
+
+def run(options: "cli.Prepare") -> None:
+    """Do what the options ask for.
+
+    A clip that can't be prepared stops none of the others.
+
+    Raises:
+        ValueError: an option out of range, an input that is no clip, a file that is missing or malformed.
+        OSError: a frame can't be written, or a process was killed. What is there stays.
+    """
+    _check(options)
+    part, parts = shard(options.shard, os.environ)
+    tasks = plan(options, part, parts)
+    console = Console()
+    hidden = not console.is_terminal or os.environ.get("LOCAL_RANK", "0") != "0"  # one bar a terminal
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden)
+    told = Told()
+    with bar:
+        shown = bar.add_task("frames", total=sum(task.frames for task in tasks))
+        advance = functools.partial(bar.advance, shown)
+        run_tasks(tasks, functools.partial(_prepare, options=options), told, advance, options.workers)
+    _print_end(console, told, tasks, f", shard {part}/{parts}" if parts > 1 else "")
+    if told.failures:
+        raise ValueError("\n".join(told.failures))
+
+
+def shard(told: str | None, environment: Mapping[str, str]) -> tuple[int, int]:
+    """Which part of the clips is this process's: (I, N), the clips I, I + N, I + 2 N ...
+
+    Args:
+        told: "I/N", 0 <= I < N, or None.
+        environment: where torchrun tells RANK and WORLD_SIZE; without them and ``told`` it is all.
+
+    Raises:
+        ValueError: no such part.
+    """
+    name, text = "`shard`", told
+    if text is None:
+        if "RANK" not in environment or "WORLD_SIZE" not in environment:
+            return 0, 1
+        name, text = "RANK/WORLD_SIZE", f"{environment['RANK']}/{environment['WORLD_SIZE']}"
+    numbers = re.fullmatch(r"(\d+)/(\d+)", text)
+    if numbers is None or int(numbers[1]) >= int(numbers[2]):
+        raise ValueError(f"{name} must be I/N with 0 <= I < N, got {text}")
+    return int(numbers[1]), int(numbers[2])
+
+
+def plan(options: "cli.Prepare", part: int = 0, parts: int = 1) -> list[Task]:
+    """The clips of one part, each with its folder.
+
+    Args:
+        options: inputs, and where to.
+        part: 0 <= part < parts.
+        parts: how many processes share the inputs.
+
+    Raises:
+        ValueError: an input that is no clip, a street without ``out``, or two clips for one folder.
+    """
+    texts = [text for given in options.inputs for text in _expanded(given)]
+    tasks: dict[Path, Task] = {}
+    plain = dataclasses.replace(options, depth_model=None, mask_model=None)  # no network is loaded to count frames
+    for text in texts[part::parts]:
+        clip = open_input(text, plain)
+        name = re.sub(r"[^\w.-]+", "_", clip.name).lstrip(".") or "clip"
+        folder = _cache(text, options) / f"{name}-{options.height}x{options.width}"
+        if folder in tasks:
+            both = f"{tasks[folder].text} and {text}"
+            raise ValueError(f"{folder}: is where both {both} would go; `--out` can part them")
+        tasks[folder] = Task(text, folder, len(clip))
+    return list(tasks.values())
+
+
+def open_input(text: str, options: "cli.Prepare") -> Clip:
+    """A clip as `vestcl forecast` opens it, or the street of "street:SEED", at the options' size.
+
+    Raises:
+        ValueError: as `vestcl.forecast_command.open_clip`.
+    """
+    reader = {name: getattr(options, name) for name in _READER}
+    street = STREETS.fullmatch(text)
+    if street is None:
+        from vestcl import cli
+
+        return open_clip(cli.Forecast(text, height=options.height, width=options.width, **reader))
+    if wrong := [name for name, unset in _READER.items() if reader[name] != unset]:
+        raise ValueError(f"{text}: is a street, whose depth and labels are its own; it does not take {', '.join(wrong)}")
+    seed, size = int(street[1]), (options.height, options.width)
+    made, start = Street.generate(seed), 0.0
+    if options.drive == "random":
+        made = dataclasses.replace(made, drive=Sway.drawn(np.random.default_rng([seed, _DRIVE])))
+        start = float(np.random.default_rng([seed, _START]).uniform(*STARTS))
+    clip = made.clip(options.frames, *size, start=start, samples=options.samples)
+    if options.street_depth == "true":
+        return clip
+    return dataclasses.replace(clip, samples=tuple(dataclasses.replace(sample, depth=None) for sample in clip))
+
+
+def _check(options: "cli.Prepare") -> None:
+    for name in ("height", "width", "samples", "workers"):
+        if getattr(options, name) < 1:
+            raise ValueError(f"`{name}` must be 1 or more, got {getattr(options, name)}")
+    if options.frames < 2:
+        raise ValueError(f"`frames` must be 2 or more, got {options.frames}")
+    if not options.inputs:
+        raise ValueError("`inputs` must be one or more clips, got none")
+    if options.out is not None and options.out.exists() and not options.out.is_dir():
+        raise ValueError(f"`out` must be a folder, got the file {options.out}")
+
+
+def _expanded(text: str) -> list[str]:
+    """A street each for street:FIRST-LAST; anything else is one clip."""
+    streets = STREETS.fullmatch(text)
+    if streets is None:
+        return [text]
+    seeds = range(int(streets[1]), int(streets[2] or streets[1]) + 1)
+    if not seeds:
+        raise ValueError(f"`inputs` must have streets from a lower to a higher seed, got {text}")
+    return [f"street:{seed}" for seed in seeds]
+
+
+def _cache(text: str, options: "cli.Prepare") -> Path:
+    if options.out is not None:
+        return options.out
+    if STREETS.fullmatch(text):
+        raise ValueError(f"{text}: is no folder to keep a cache in; `--out` must name one")
+    path = Path(text)
+    return (path if path.is_dir() else path.parent) / BESIDE
+
+
+def estimators(options: "cli.Prepare") -> str:
+    """What tells the networks apart that the options name: hub names, or a folder's files, their sizes and times."""
+    told = []
+    for model in (options.depth_model, options.mask_model):
+        files = sorted(path for path in Path(model).rglob("*") if path.is_file()) if model else []
+        about = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+        told.append(repr(about) if about else repr(model))
+    return "|".join(told) if any((options.depth_model, options.mask_model)) else ""
+
+
+def _prepare(task: Task, waits: bool, report: Report, options: "cli.Prepare") -> Outcome | None:
+    clip = open_input(task.text, options)
+    return prepare_clip(clip, task.folder, estimators=estimators(options), wait=waits, report=report)
+
+
+def _print_end(console: Console, told: Told, tasks: Sequence[Task], which: str) -> None:
+    table = Table("stage", box=box.SIMPLE)
+    table.add_column("seconds", justify="right")
+    for stage, taken in (told.seconds | {"all": sum(told.seconds.values())}).items():
+        table.add_row(stage, f"{taken:.2f}")
+    console.print(table)
+    about = f"{len(tasks)} clip{'s' * (len(tasks) != 1)}{which}: {told.computed} frames computed, {told.kept} kept"
+    console.print(about, highlight=False)
+    for folder in dict.fromkeys(str(task.folder.parent) for task in tasks):
+        console.print(folder, highlight=False, markup=False, soft_wrap=True)
