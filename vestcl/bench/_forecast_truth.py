@@ -18,6 +18,9 @@ from vestcl.data.street_clip import Shot, StreetImage
 from vestcl.forecast import Forecast
 from vestcl.geometric.render import Cloud, show
 from vestcl.io.labels import SKY, background
+from vestcl.scoring import ego_errors, true_motion
+
+__all__ = ["Facts", "ego_errors", "motion_errors", "shot", "splatter_alone", "step_truth", "true_motion"]
 
 #: A thing that moves by less than that by itself from frame to frame (metres) stands.
 STILL: Final = 0.01
@@ -43,42 +46,9 @@ class Facts:
     """By what is measured, a number a step."""
 
 
-def true_motion(clip: Clip, index: int, steps: int) -> list[Array] | None:
-    """future_from_cur = world_from_cam(t + k)^-1 world_from_cam(t) for k = 1 ... steps.
-
-    Args:
-        clip: frames with or without poses.
-        index: the current frame t.
-        steps: k's end; t + steps is a frame.
-
-    Returns:
-        [4, 4] m a step, or None where a pose is unknown.
-    """
-    poses = [sample.world_from_cam for sample in clip[index : index + steps + 1]]
-    known = [pose for pose in poses if pose is not None]
-    if len(known) < len(poses):
-        return None
-    return [calibration.invert(pose) @ known[0] for pose in known[1:]]
-
-
 def shot(sample: Sample) -> Shot | None:
     """How the street took this sample, or None: it is no street's."""
     return sample.image.shot if isinstance(sample.image, StreetImage) else None
-
-
-def ego_errors(forecast: Forecast, truth: list[Array]) -> dict[str, list[float]]:
-    """`metrics.ego_motion_error` of ``future_from_cur``, step by step.
-
-    Args:
-        forecast: with ``future_from_cur``.
-        truth: see `true_motion`.
-
-    Returns:
-        "rotation_deg" and "translation_percent"; the latter NaN where the car stood.
-    """
-    estimate, wanted = (torch.from_numpy(np.stack(motions)) for motions in (forecast.future_from_cur, truth))
-    errors = metrics.ego_motion_error(estimate, wanted)
-    return {name: values.tolist() for name, values in errors._asdict().items()}
 
 
 def step_truth(clip: Clip, index: int) -> NDArray[np.float32]:

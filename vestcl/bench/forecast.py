@@ -20,7 +20,6 @@ from vestcl.bench import _forecast_tables as tables
 from vestcl.bench import _forecast_truth as known
 from vestcl.bench import _forecast_windows as windows
 from vestcl.bench._forecast_truth import Facts
-from vestcl.bench._forecast_windows import SOURCE, Record, Truth
 from vestcl.bench.splat import describe, write_json
 from vestcl.data import Street
 from vestcl.data.open import open_sequence
@@ -29,6 +28,7 @@ from vestcl.forecast import View
 from vestcl.geometric import Perception
 from vestcl.io.atomic import write_bytes
 from vestcl.models.trunks import Trunk, load_trunk
+from vestcl.scoring import SOURCE, Record, Truth
 from vestcl.views import parse_views
 
 #: Streets that nothing is tuned, trained or tested on: what "street:" stands for.

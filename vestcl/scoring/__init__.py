@@ -1,0 +1,76 @@
+"""How good forecasts are, window by window: `vestcl bench forecast` and `python -m train.evaluate` score alike.
+
+A window has frames t-1 and t in sight, and t+1 to t+steps as truth. Pictures and truth are resized to the size that is
+scored, and quantised to 8 bit.
+"""
+
+from vestcl.scoring.motion import ego_errors, true_motion
+from vestcl.scoring.pictures import (
+    GEOMETRIC,
+    ORACLE,
+    OTHER_CAMERA,
+    RIGHT,
+    SOURCE,
+    Forecasts,
+    Look,
+    Prediction,
+    Predictions,
+    Record,
+    Timed,
+    Truth,
+    look,
+    predictions,
+    score,
+)
+from vestcl.scoring.tables import (
+    METRICS,
+    Grid,
+    Metric,
+    by_method,
+    by_view,
+    finite,
+    horizon,
+    means,
+    number,
+    picture_grids,
+    running_mean,
+    steps_of,
+    summarise,
+    to_markdown,
+    to_rich,
+)
+
+__all__ = [
+    "GEOMETRIC",
+    "METRICS",
+    "ORACLE",
+    "OTHER_CAMERA",
+    "RIGHT",
+    "SOURCE",
+    "Forecasts",
+    "Grid",
+    "Look",
+    "Metric",
+    "Prediction",
+    "Predictions",
+    "Record",
+    "Timed",
+    "Truth",
+    "by_method",
+    "by_view",
+    "ego_errors",
+    "finite",
+    "horizon",
+    "look",
+    "means",
+    "number",
+    "picture_grids",
+    "predictions",
+    "running_mean",
+    "score",
+    "steps_of",
+    "summarise",
+    "to_markdown",
+    "to_rich",
+    "true_motion",
+]

@@ -1,0 +1,279 @@
+"""Pictures beside the truth: what every method shows of a window's next frames, and how good it is."""
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vestcl import baselines, metrics
+from vestcl.compare import FLOW, REPEAT
+from vestcl.data.resize import resize_image
+from vestcl.data.sample import Clip
+from vestcl.forecast import Forecast, View
+from vestcl.models.trunks import Trunk
+from vestcl.perceptual import Lpips, _squared_difference
+from vestcl.views import seen_by
+
+#: The forecast without weights, as tables and files call it.
+GEOMETRIC: Final = "geometric"
+
+#: What baselines have in sight of where they are judged from another camera than their own.
+OTHER_CAMERA: Final = ", left camera"
+ORACLE: Final = f"{FLOW}, right camera's past (oracle)"
+
+#: A pixel counts as seen by the source camera from this coverage on.
+SEEN: Final = 0.5
+
+#: The rig's cameras, as views are called.
+SOURCE: Final = "source"
+RIGHT: Final = "right"
+
+Pictures = Sequence[NDArray[np.float32]]
+"""[3, H, W] RGB in [0, 1], a step each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """One method's pictures of one view."""
+
+    pictures: Pictures
+    seconds: float
+    """That the method took for the window, all views together."""
+
+
+Predictions = dict[str, dict[str, Prediction]]
+"""By view and method."""
+
+
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """A forecast and how long it took."""
+
+    forecast: Forecast
+    seconds: float
+
+
+Forecasts = Mapping[str, Timed]
+"""By method."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """How good one method's pictures of one view of one window are."""
+
+    clip: str
+    frame: str
+    index: int
+    """Of the current frame t in the clip."""
+    view: str
+    method: str
+    seconds: float
+    scores: dict[str, list[float]]
+    """By metric, a number a step."""
+    first: int = 1
+    """The first of these steps: 0 is the current frame itself."""
+
+
+class Look(NamedTuple):
+    """A picture as it is scored."""
+
+    picture: torch.Tensor
+    """[1, 3, h, w], 8 bit."""
+    maps: list[torch.Tensor]
+    """SqueezeNet's, [1, C_l, h_l, w_l]; none without a trunk."""
+    lpips_maps: list[torch.Tensor]
+    """The same of LPIPS's trunk."""
+
+
+class Truth:
+    """What the cameras of a clip really saw, kept while windows need it.
+
+    Args:
+        clip: at its own size.
+        size: (height, width) that is scored, px.
+        trunk: SqueezeNet 1.0, or None.
+        lpips: or None.
+    """
+
+    def __init__(
+        self, clip: Clip, size: tuple[int, int], trunk: Trunk | None = None, lpips: Lpips | None = None
+    ) -> None:
+        self.clip, self.size, self.trunk, self.lpips = clip, size, trunk, lpips
+        self._full: dict[tuple[str, int], NDArray[np.float32]] = {}
+        self._looks: dict[tuple[str, int], Look] = {}
+
+    def full(self, view: View, index: int) -> NDArray[np.float32]:
+        """[3, H, W] of frame ``index``, at the size of the camera.
+
+        Raises:
+            ValueError: no camera stood at ``view``.
+        """
+        key = view.name, index
+        if key not in self._full:
+            camera = seen_by(view, self.clip[index])
+            if camera is None:
+                raise ValueError(f"{self.clip.name}: frame {self.clip[index].name} has no picture from {view.name}")
+            self._full[key] = camera.read_image()
+        return self._full[key]
+
+    def look(self, view: View, index: int) -> Look:
+        """The same as it is scored."""
+        key = view.name, index
+        if key not in self._looks:
+            self._looks[key] = look([self.full(view, index)], self.size, self.trunk, self.lpips)[0]
+        return self._looks[key]
+
+    def forget(self, index: int) -> None:
+        """Drop frames before ``index``: windows come in order."""
+        for kept in (self._full, self._looks):
+            for key in [key for key in kept if key[1] < index]:
+                del kept[key]
+
+
+def look(
+    pictures: Pictures, size: tuple[int, int], trunk: Trunk | None = None, lpips: Lpips | None = None
+) -> list[Look]:
+    """Resize, quantise, and take the trunks' maps of all pictures in one go.
+
+    Args:
+        pictures: [3, H, W] each.
+        size: (height, width) px.
+        trunk: SqueezeNet 1.0, or None.
+        lpips: or None.
+
+    Raises:
+        ValueError: pictures too small for a trunk.
+    """
+    resized = np.stack([resize_image(picture, *size) for picture in pictures])
+    batch = metrics.quantise(torch.from_numpy(resized))
+    trunks = (trunk, None if lpips is None else lpips.trunk)
+    with torch.no_grad():
+        # Convolutions are as fast in either layout, pooling and norms over channels twice as fast in this one.
+        maps = [[] if one is None else one(batch.contiguous(memory_format=torch.channels_last)) for one in trunks]
+    return [Look(batch[i : i + 1], *([level[i : i + 1] for level in one] for one in maps)) for i in range(len(batch))]
+
+
+def predictions(truth: Truth, index: int, steps: int, views: Sequence[View], forecasts: Forecasts) -> Predictions:
+    """What the baselines and ``forecasts`` show of one window.
+
+    The baselines see the source camera alone, as the forecasts do, and are held against every view. Of another view
+    optical flow is shown once more with that camera's own past, which no forecast from the source camera has.
+
+    Args:
+        truth: of the clip.
+        index: the current frame t, 1 or more.
+        steps: frames that were forecast.
+        views: cameras to judge from, each one of the rig's.
+        forecasts: of all views, ``steps`` frames or more.
+
+    Raises:
+        ValueError: no camera stood at a view.
+    """
+    source = View(SOURCE, np.eye(4))
+    current = truth.full(source, index)
+    flow = _flow(truth.full(source, index - 1), current, steps)
+    plain = {REPEAT: Prediction([current] * steps, 0.0), FLOW: flow}
+    shown: Predictions = {}
+    for view in views:
+        is_source = view.name == SOURCE
+        of_view = {name + ("" if is_source else OTHER_CAMERA): each for name, each in plain.items()}
+        if not is_source:
+            of_view[ORACLE] = _flow(truth.full(view, index - 1), truth.full(view, index), steps)
+        for name, made in forecasts.items():
+            pictures = [frame[view.name].image for frame in made.forecast.frames[:steps]]
+            of_view[name] = Prediction(pictures, made.seconds)
+        shown[view.name] = of_view
+    return shown
+
+
+def score(
+    truth: Truth, index: int, views: Sequence[View], predictions: Predictions, forecast: Forecast, first: int = 1
+) -> list[Record]:
+    """Every prediction of one window beside the truth, step by step.
+
+    Args:
+        truth: of the clip.
+        index: the current frame t.
+        views: as in ``predictions``.
+        predictions: by view and method, a picture a step.
+        forecast: its coverage tells which pixels the source camera has seen ("psnr_seen").
+        first: the step that ``forecast`` begins with, 0 for the current frame itself.
+
+    Returns:
+        A record a view and method.
+    """
+    scores: dict[tuple[str, str], dict[str, list[float]]] = {}
+    known: dict[int, Look] = {}
+    for step in range(len(forecast.frames)):
+        shown = {v: {m: each.pictures[step] for m, each in of.items()} for v, of in predictions.items()}
+        known = _looks((picture for of in shown.values() for picture in of.values()), known, truth)
+        for view in views:
+            looks = [known[id(picture)] for picture in shown[view.name].values()]
+            coverage = resize_image(forecast.frames[step][view.name].coverage, *truth.size)
+            wanted, seen = truth.look(view, index + first + step), torch.from_numpy(coverage >= SEEN)[None]
+            of_view = _scores(looks, wanted, seen, truth.lpips)
+            for row, method in enumerate(shown[view.name]):
+                of_method = scores.setdefault((view.name, method), {name: [] for name in of_view})
+                for name, values in of_view.items():
+                    of_method[name].append(float(values[row]))
+    where = truth.clip.name, truth.clip[index].name, index
+    seconds = {(view, name): each.seconds for view, of in predictions.items() for name, each in of.items()}
+    return [Record(*where, *key, seconds[key], of, first) for key, of in scores.items()]
+
+
+def _looks(pictures: Iterable[NDArray[np.float32]], known: Mapping[int, Look], truth: Truth) -> dict[int, Look]:
+    """By the pictures' ids. Some occur twice, in several views or, the last frame, in every step; they are looked at
+    once."""
+    wanted = {id(picture): picture for picture in pictures}
+    new = {key: picture for key, picture in wanted.items() if key not in known}
+    found = look(list(new.values()), truth.size, truth.trunk, truth.lpips) if new else []
+    return {key: known[key] for key in wanted if key in known} | dict(zip(new, found, strict=True))
+
+
+def _scores(looks: Sequence[Look], wanted: Look, seen: torch.Tensor, lpips: Lpips | None) -> dict[str, torch.Tensor]:
+    """Of M pictures, all metrics that the size allows, [M] each."""
+    pictures = torch.cat([each.picture for each in looks])
+    target = wanted.picture.expand_as(pictures)
+    side = min(pictures.shape[2:])
+    scores = {"psnr": metrics.psnr(pictures, target)}
+    if side >= metrics.WINDOW:
+        scores["ssim"] = metrics.ssim(pictures, target)
+    if side >= metrics.MS_SSIM_SIDE:
+        scores["ms_ssim"] = metrics.ms_ssim(pictures, target)
+    if wanted.maps:
+        scores["squeeze"] = torch.cat([distance(each.maps, wanted.maps) for each in looks])
+    if lpips is not None:
+        heads = list(lpips.heads)
+        scores["lpips"] = torch.cat([distance(each.lpips_maps, wanted.lpips_maps, heads) for each in looks])
+    scores["psnr_seen"] = metrics.psnr(pictures, target, seen.expand(len(pictures), -1, -1, -1))
+    return scores
+
+
+def distance(
+    maps: Sequence[torch.Tensor], wanted: Sequence[torch.Tensor], heads: Sequence[torch.Tensor] | None = None
+) -> torch.Tensor:
+    """`vestcl.perceptual.squeeze_distance`, or with ``heads`` `Lpips`, of maps that are there already: [1].
+
+    Args:
+        maps: [1, C_l, h_l, w_l] a layer.
+        wanted: the same of the truth.
+        heads: [C_l] a layer.
+    """
+    squares = [_squared_difference(f, g) for f, g in zip(maps, wanted, strict=True)]
+    if heads is None:
+        layers = [square.sum(dim=1) for square in squares]
+    else:
+        pairs = zip(squares, heads, strict=True)
+        layers = [torch.einsum("bchw,c->bhw", square, head) for square, head in pairs]
+    return torch.stack([layer.mean(dim=(1, 2)) for layer in layers]).sum(dim=0)
+
+
+def _flow(previous: NDArray[np.float32], current: NDArray[np.float32], steps: int) -> Prediction:
+    start = time.perf_counter()
+    before, now = (torch.from_numpy(np.ascontiguousarray(image))[None] for image in (previous, current))
+    pictures = list(baselines.flow_extrapolation(before, now, steps)[0].numpy())
+    return Prediction(pictures, time.perf_counter() - start)
