@@ -2,6 +2,9 @@
 
 from setuptools import find_packages, setup
 
+#: Of train/, which is not part of the package.
+TRAIN = ["pydantic>=2.7", "PyYAML>=6", "tensorboard>=2.16"]
+
 setup(
     name="vestcl",
     version="0.1.0",
@@ -12,7 +15,7 @@ setup(
     # The kernels live beside the package in a checkout and inside it in a wheel; runtime.kernel_folder() knows both.
     packages=[*find_packages(include=["vestcl", "vestcl.*"]), "vestcl.kernels"],
     package_dir={"vestcl.kernels": "kernels"},
-    package_data={"vestcl.kernels": ["*.cl", "*.h"]},
+    package_data={"vestcl": ["weights/*.safetensors"], "vestcl.kernels": ["*.cl", "*.h"]},
     install_requires=[
         "matplotlib>=3.8",
         "numpy>=1.26",
@@ -29,6 +32,7 @@ setup(
     ],
     extras_require={
         "dev": [
+            *TRAIN,
             "hypothesis>=6.100",
             "ipykernel>=6.29",
             "mypy>=1.11",
@@ -37,9 +41,11 @@ setup(
             "pytest>=8",
             "ruff>=0.8",
             "setuptools>=77",
+            "types-PyYAML>=6",
         ],
         "estimators": ["transformers>=4.57"],
         "intel": ["intel-cmplr-lib-rt", "intel-opencl-rt"],
+        "train": TRAIN,
     },
     entry_points={"console_scripts": ["vestcl = vestcl.cli:main"]},
 )

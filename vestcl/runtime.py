@@ -15,6 +15,7 @@ import os
 import re
 import shutil
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -217,6 +218,8 @@ class Session:
     def __init__(self, info: DeviceInfo, mapping: str, device: cl.Device) -> None:
         self.info = info
         self.mapping = mapping
+        #: That jobs took so far, from their first argument to their last result: what a caller waits for OpenCL.
+        self.seconds = 0.0
         # Oclgrind calls itself a CPU, but takes memory that it did not copy for uninitialised.
         self.shares_host_memory = info.kind == "CPU" and info.platform != "Oclgrind"
         # Compilers that turn clang's builtins for prefetching and streaming into the instructions.
@@ -294,6 +297,7 @@ class Job:
     def __enter__(self) -> "Job":
         self.session._lock.acquire()
         self._outer, self.session._job = self.session._job, self
+        self._started = time.perf_counter()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -307,6 +311,8 @@ class Job:
                 self._outer._bound += self._bound
                 self._outer._outputs += self._outputs
         finally:
+            if self._outer is None:
+                self.session.seconds += time.perf_counter() - self._started
             self.session._lock.release()
 
     def read(self, array: np.ndarray) -> Buffer:

@@ -3,6 +3,7 @@
 Clouds of a batch differ in size, so they are packed: image b owns the points starts[b]:starts[b + 1].
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from vestcl.ops.unproject import unproject
 
 
 class Cloud(NamedTuple):
-    """Points of one input frame's layers, for all B images; gradients flow through all but ``step_xyz``."""
+    """Points of one input frame's layers, for all B images; gradients flow through all."""
 
     points_xyz: torch.Tensor
     """[P, 3] m, in a camera of their own."""
@@ -30,6 +31,9 @@ class Cloud(NamedTuple):
     """[P, C + 3]: features and colour."""
     background: torch.Tensor
     """[P, 1]: 1 on the static background."""
+    beside: torch.Tensor
+    """int64 [P, 4]: which points are to the left, to the right, above and below in the frame that they come from; where
+    there is none, and for inpainted points, the point itself."""
     starts: torch.Tensor
     """int64 [B + 1]."""
 
@@ -56,6 +60,11 @@ def as_points(image: torch.Tensor) -> torch.Tensor:
     return image.permute(0, 2, 3, 1).flatten(1, 2)
 
 
+def as_image(points: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """[B, H W, C] -> [B, C, H, W], what `as_points` undoes."""
+    return points.unflatten(1, (height, width)).permute(0, 3, 1, 2)
+
+
 def lift(
     frame: EncodedFrame, to_next: RigidMotion, flow: torch.Tensor, flow0: torch.Tensor, intervals: int, K: torch.Tensor
 ) -> Cloud:
@@ -77,16 +86,31 @@ def lift(
     still = torch.zeros_like(behind)
     shown = torch.cat([frame.features, layers.image], dim=1)
     shown_behind = torch.cat([frame.background_features, layers.background_image], dim=1)
-    sizes = torch.tensor([0] + [behind.shape[1] + len(where) for where in hidden])
+    sizes = torch.tensor([0] + [behind.shape[1] + len(where) for where in hidden]).cumsum(0)
     return Cloud(
         points_xyz=pack(unproject(layers.depth, K), behind, hidden),
         displacement_xyz=pack(as_points(flow), rigid_flow(behind, *to_next), hidden),
-        step_xyz=pack(as_points((flow - flow0).detach() / intervals), still, hidden),
+        step_xyz=pack(as_points((flow - flow0) / intervals), still, hidden),
         depth=pack(as_points(layers.depth), as_points(layers.background_depth), hidden)[:, 0],
         shown=pack(as_points(shown), as_points(shown_behind), hidden),
         background=pack(as_points(layers.mask), still[..., :1] + 1, hidden),
-        starts=sizes.cumsum(0),
+        beside=_neighbours(sizes.tolist(), *layers.image.shape[2:]),
+        starts=sizes,
     )
+
+
+def _neighbours(starts: Sequence[int], height: int, width: int) -> torch.Tensor:
+    """`Cloud.beside` of images whose H W pixels come first from ``starts`` on, the last of which is their end."""
+    place = torch.arange(height * width).view(height, width)
+    sides = [
+        torch.cat([place[:, :1], place[:, :-1]], dim=1), torch.cat([place[:, 1:], place[:, -1:]], dim=1),
+        torch.cat([place[:1], place[:-1]], dim=0), torch.cat([place[1:], place[-1:]], dim=0),
+    ]  # fmt: skip
+    of_pixels, alone = torch.stack(sides, dim=2).flatten(0, 1), torch.arange(starts[-1])[:, None].expand(-1, 4)
+    pieces = []
+    for start, end in itertools.pairwise(starts):
+        pieces += [of_pixels + start, alone[start + height * width : end]]
+    return torch.cat(pieces)
 
 
 def join(first: Cloud, second: Cloud) -> Cloud:
@@ -97,8 +121,13 @@ def join(first: Cloud, second: Cloud) -> Cloud:
         pairs = zip(one.split(sizes[0]), other.split(sizes[1]), strict=True)
         return torch.cat([piece for pair in pairs for piece in pair])
 
-    packed = (alternate(one, other) for one, other in zip(first[:-1], second[:-1], strict=True))
-    return Cloud._make([*packed, first.starts + second.starts])
+    packed = [alternate(one, other) for one, other in zip(first[:-2], second[:-2], strict=True)]
+    shifts = (
+        second.starts[:-1].repeat_interleave(first.starts.diff()),
+        first.starts[1:].repeat_interleave(second.starts.diff()),
+    )
+    beside = alternate(*(cloud.beside + shift[:, None] for cloud, shift in zip((first, second), shifts, strict=True)))
+    return Cloud._make([*packed, beside, first.starts + second.starts])
 
 
 def advance(cloud: Cloud, next_from_cur: torch.Tensor) -> Cloud:

@@ -8,14 +8,16 @@ import torch
 from vestcl import constants
 from vestcl.models._clouds import Cloud, last_motion
 from vestcl.models._layers import check
+from vestcl.models.config import LEAST_COVERAGE, RenderConfig
 from vestcl.ops.displace import displace
 from vestcl.ops.splat import composite, rasterize
 
+#: Pixels that were next to each other belong to one surface if the view shows them no farther apart than that, times
+#: what it magnifies (as in vestcl/geometric/render.py).
+_TORN: Final = 2.5
+
 #: Limits of a footprint's radius, px: half the splatter's tile, and where a footprint can miss every pixel centre.
 RADIUS: Final = (0.5, constants.TILE / 2)
-
-#: A pixel that is covered by less has no depth of its own: one footprint's outermost tenth alone is on it.
-LEAST_COVERAGE: Final = 0.1
 
 
 class Camera(NamedTuple):
@@ -75,16 +77,25 @@ def checked_camera(camera: tuple[torch.Tensor, torch.Tensor], batch: int) -> Cam
 
 
 def splat_cloud(
-    cloud: Cloud, camera: Camera, K: torch.Tensor, next_from_cur: torch.Tensor, rho: float, height: int, width: int
+    cloud: Cloud,
+    camera: Camera,
+    K: torch.Tensor,
+    next_from_cur: torch.Tensor,
+    config: RenderConfig,
+    height: int,
+    width: int,
 ) -> Side:
     """Show a cloud in ``camera``: opaque points of radius r = rho z_src / z_tgt f_tgt / f_src, clamped to RADIUS.
+
+    With ``config.stretched`` r grows with the distance to what was beside a point, and points that nothing is beside
+    any more are left out: see `_surface`.
 
     Args:
         cloud: of B images.
         camera: B of them.
         K: [B, 3, 3] px, of the camera that the cloud was seen by.
         next_from_cur: [B, 4, 4] m, the camera's last motion, for ``motion_xyz``.
-        rho: radius in source pixels.
+        config: rho, the radius in source pixels.
         height: rows of the view.
         width: columns of the view.
 
@@ -95,14 +106,55 @@ def splat_cloud(
     near = z.clamp(min=constants.NEAR)
     zoom = (camera.K[:, 0, 0] * camera.K[:, 1, 1] / (K[:, 0, 0] * K[:, 1, 1])).sqrt()
     zoom_of_point = zoom.repeat_interleave(cloud.starts.diff())
-    radii = (rho * zoom_of_point * cloud.depth / near).clamp(*RADIUS)
-    raster = rasterize(points_uv, z.detach(), radii, torch.ones_like(z), height, width, cloud_starts=cloud.starts)
+    magnified, opacities = zoom_of_point * cloud.depth / near, torch.ones_like(z)
+    if config.stretched:
+        stretch, opacities = _surface(points_uv.detach(), magnified.detach(), cloud.beside)
+        magnified = magnified * stretch
+    radii = (config.rho * magnified).clamp(*RADIUS)
+    raster = rasterize(points_uv, z.detach(), radii, opacities, height, width, cloud_starts=cloud.starts)
     image, coverage = composite(raster, torch.cat([cloud.shown, near.reciprocal()[:, None]], dim=1))
     features, colour, inverse_depth = image.split([image.shape[1] - 4, 3, 1], dim=1)
     with torch.no_grad():
         known = torch.cat([cloud.background, last_motion(cloud, next_from_cur) / near[:, None]], dim=1)
         background, inverse_motion = composite(raster, known)[0].split([1, 3], dim=1)
     return Side(features, colour, coverage, inverse_depth, background, inverse_motion)
+
+
+def _surface(
+    points_uv: torch.Tensor, magnified: torch.Tensor, beside: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """How much farther apart than ``magnified`` a surface's points are, and which points still are of a surface.
+
+    A surface that turns towards the camera is stretched by more than what it comes nearer by. Neighbours are together
+    up to _TORN times the magnification; of those at either side the nearer counts, of both directions the wider.
+
+    Args:
+        points_uv: [P, 2] px.
+        magnified: [P], size of a source pixel, px.
+        beside: `Cloud.beside`.
+
+    Returns:
+        Factor [P], 1 or more; opacity [P], 0 where a point had neighbours and none is near it any more.
+    """
+    gap = torch.linalg.vector_norm(points_uv[beside] - points_uv[:, None], dim=2)
+    has_neighbour = beside != torch.arange(len(beside))[:, None]
+    together = has_neighbour & (gap < _TORN * magnified.clamp(min=1)[:, None])
+    nearer = torch.where(together, gap, torch.inf).unflatten(1, (2, 2)).amin(dim=2)
+    spacing = torch.where(nearer.isfinite(), nearer, 0).amax(dim=1)
+    opaque = together.any(dim=1) | ~has_neighbour.any(dim=1)
+    return (spacing / magnified.clamp(min=1e-6)).clamp(min=1), opaque.to(points_uv)
+
+
+def refined_channels(side: Side, colour: bool, normalised: bool) -> torch.Tensor:
+    """What refinement sees of a side, [B, C, H, W]: features, and with ``colour`` colour, coverage, inverse depth.
+
+    ``normalised`` divides all but coverage by it, or by LEAST_COVERAGE where there is less.
+    """
+    per_coverage = 1 / side.coverage.clamp(min=LEAST_COVERAGE) if normalised else 1
+    planes = [side.features * per_coverage]
+    if colour:
+        planes += [side.colour * per_coverage, side.coverage, side.inverse_depth * per_coverage]
+    return torch.cat(planes, dim=1)
 
 
 def compose_view(sides: Sequence[Side], image: torch.Tensor) -> RenderedView:

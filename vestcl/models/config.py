@@ -7,6 +7,10 @@
     +features-only          the paper's literal 32 rendered channels: features and nothing else
     +joint                  both clouds splatted together in one depth-ordered pass
     +residual               refinement adds to the splatted colour instead of painting anew
+    +filled                 it adds to that colour divided by coverage, holes filled from what surrounds them
+    +painting               it paints anew
+    +from-rest              motion starts from rest, not from what was measured
+    +from-prior             motion starts from what was measured: see `MotionPrior`
     +omf-paper  +omf-dmvfn  the two published shapes of object motion
     +routing                a small network picks which blocks of object motion run
 
@@ -36,6 +40,12 @@ REFINE_GROUP: Final = 32
 
 #: The footprint's radius in source pixels (3D Moments): for features that a network then refines.
 RHO: Final = 1.5
+
+#: A pixel that is covered by less has no depth of its own: one footprint's outermost tenth alone is on it.
+LEAST_COVERAGE: Final = 0.1
+
+#: The same where colour is shown directly, and refinement only adds to it (SPEC section 2).
+RHO_DIRECT: Final = 0.95
 
 
 @dataclass(frozen=True)
@@ -117,6 +127,10 @@ class RenderConfig:
     """Both clouds in one depth-ordered pass; False renders each on its own, previous frame first."""
     rho: float = RHO
     """Radius in source pixels."""
+    stretched: bool = False
+    """Radii grow with the distance between a surface's points, and points without a surface are left out."""
+    normalised: bool = False
+    """Features, colour and inverse depth go into refinement divided by coverage; False leaves them times coverage."""
 
     def side_channels(self, features: int) -> int:
         """Channels of one rendered image: features, and then colour 3, coverage 1, inverse depth 1 (1/m)."""
@@ -136,8 +150,13 @@ class RefineConfig:
     stem_kernel: int = 7
     widths: tuple[int, ...] = (64, 128, 256, 512)
     """Channels at H/2, H/4, ...; the bottleneck has the last."""
-    residual: bool = False
-    """Add to coverage x splatted colour; False paints the image through a sigmoid."""
+    base: Literal["none", "splatted", "filled"] = "none"
+    """What refinement adds to: coverage x splatted colour; or that colour divided by coverage and, where nothing
+    covers, filled from what surrounds it. "none" paints the image through a sigmoid."""
+
+    def __post_init__(self) -> None:
+        if self.base not in ("none", "splatted", "filled"):
+            raise ValueError(f'`base` must be "none", "splatted" or "filled", got {self.base!r}')
 
 
 @dataclass(frozen=True)
@@ -154,10 +173,16 @@ class ModelConfig:
     refine: RefineConfig = RefineConfig()
     fixed_depth: float | None = None
     """Metres, for every pixel; None uses the depth that comes in."""
+    start: Literal["rest", "prior"] = "rest"
+    """What motion networks correct: no motion, or one that was measured and extrapolated (`MotionPrior`)."""
 
     def __post_init__(self) -> None:
-        if self.refine.residual and not self.render.colour:
-            raise ValueError("`refine.residual` adds to the rendered colour, so it needs `render.colour`")
+        if self.start not in ("rest", "prior"):
+            raise ValueError(f'`start` must be "rest" or "prior", got {self.start!r}')
+        if self.refine.base != "none" and not self.render.colour:
+            raise ValueError("`refine.base` adds to the rendered colour, so it needs `render.colour`")
+        if self.refine.base == "filled" and not self.render.normalised:
+            raise ValueError('`refine.base` "filled" needs `render.normalised`')
         if self.fixed_depth is not None and not LOG_DEPTH_NEAR <= self.fixed_depth <= LOG_DEPTH_FAR:
             raise ValueError(f"`fixed_depth` must be in [{LOG_DEPTH_NEAR}, {LOG_DEPTH_FAR}] m, got {self.fixed_depth}")
 
@@ -168,8 +193,10 @@ VEST_S: Final = ModelConfig(
     "vest-s",
     encoder=EncoderConfig(widths=(24, 48, 96), blocks=(2, 2, 2), decoder=(48, 32), features=16),
     ego_motion=EgoMotionConfig(widths=(32, 32, 64, 64)),
-    object_motion=ObjectMotionConfig("dmvfn", widths=(64, 64, 64, 32, 32, 32, 16, 16, 16), detail=8),
-    refine=RefineConfig(stem=16, stem_kernel=3, widths=(32, 64, 96, 128)),
+    object_motion=ObjectMotionConfig("dmvfn", scales=(4, 4, 2, 2, 1, 1), widths=(64, 64, 32, 32, 16, 16), detail=8),
+    render=RenderConfig(rho=RHO_DIRECT, stretched=True, normalised=True),
+    refine=RefineConfig(stem=16, stem_kernel=3, widths=(32, 64, 96, 128), base="filled"),
+    start="prior",
 )
 
 #: The whole models, by name.
@@ -183,15 +210,28 @@ def _change_object_motion(config: ModelConfig, **fields: object) -> ModelConfig:
     return dataclasses.replace(config, object_motion=changed)
 
 
+def _without_colour(config: ModelConfig) -> ModelConfig:
+    return dataclasses.replace(config, render=dataclasses.replace(config.render, colour=False))
+
+
+def _change_base(config: ModelConfig, base: Literal["none", "splatted", "filled"]) -> ModelConfig:
+    render = dataclasses.replace(config.render, normalised=base == "filled")
+    return dataclasses.replace(config, refine=dataclasses.replace(config.refine, base=base), render=render)
+
+
 #: What may follow a model's name after "+": the change that it makes.
 VARIANTS: Final[Mapping[str, Callable[[ModelConfig], ModelConfig]]] = MappingProxyType(
     {
         "fixed-depth": lambda c: dataclasses.replace(c, fixed_depth=FIXED_DEPTH),
         "no-emf": lambda c: dataclasses.replace(c, ego_motion=None),
         "no-omf": lambda c: dataclasses.replace(c, object_motion=None),
-        "features-only": lambda c: dataclasses.replace(c, render=dataclasses.replace(c.render, colour=False)),
+        "features-only": lambda c: _without_colour(_change_base(c, "none")),
         "joint": lambda c: dataclasses.replace(c, render=dataclasses.replace(c.render, joint=True)),
-        "residual": lambda c: dataclasses.replace(c, refine=dataclasses.replace(c.refine, residual=True)),
+        "residual": lambda c: _change_base(c, "splatted"),
+        "filled": lambda c: _change_base(c, "filled"),
+        "painting": lambda c: _change_base(c, "none"),
+        "from-rest": lambda c: dataclasses.replace(c, start="rest"),
+        "from-prior": lambda c: dataclasses.replace(c, start="prior"),
         "omf-paper": lambda c: _change_object_motion(c, shape="paper"),
         "omf-dmvfn": lambda c: _change_object_motion(c, shape="dmvfn"),
         "routing": lambda c: _change_object_motion(c, routing=RoutingConfig()),

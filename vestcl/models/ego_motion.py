@@ -6,6 +6,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from vestcl import geometry
 from vestcl.models._layers import frame_pair
 from vestcl.models.config import EgoMotionConfig
 
@@ -17,6 +18,9 @@ BACKGROUND_SHARE: Final = 0.5
 
 #: Wavelengths of the positions go from 2 pi to this many tokens times 2 pi (Vaswani et al. 2017).
 LONGEST_WAVE: Final = 10_000.0
+
+#: A prior's rotations, radians, are shown to the network times that, and are then as large as its translations, metres.
+_TURN_SHOWN: Final = 100.0
 
 #: No motion: the quaternion (1, 0, 0, 0) and the translation 0.
 _REST: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -30,6 +34,12 @@ class RigidMotion(NamedTuple):
     translation: torch.Tensor
     """[B, 3] m."""
 
+    def after(self, first: "RigidMotion") -> "RigidMotion":
+        """x -> R (R_first x + t_first) + t."""
+        quaternion = geometry.quaternion_multiply(self.quaternion, first.quaternion)
+        turned = (geometry.quaternion_to_matrix(self.quaternion) @ first.translation[..., None])[..., 0]
+        return RigidMotion(quaternion, turned + self.translation)
+
 
 class EgoMotion(nn.Module):
     """Two backgrounds -> the camera's motion from each of them to the next frame.
@@ -39,10 +49,13 @@ class EgoMotion(nn.Module):
     goes through a linear layer whose weight starts at 0 and whose bias is rest. Foreground is neither looked at by
     other tokens nor part of the mean, unless there is nothing else.
 
+    With ``start`` "prior" the answer is a motion after the prior one, at first the prior itself, and a linear layer
+    of the prior's numbers is added to every token.
+
     Source: SPEC section 4; the paper's section on ego-motion forecasting.
     """
 
-    def __init__(self, config: EgoMotionConfig | None = None, features: int = 32) -> None:
+    def __init__(self, config: EgoMotionConfig | None = None, features: int = 32, start: str = "rest") -> None:
         super().__init__()
         config = config or EgoMotionConfig()
         self.features = features
@@ -57,6 +70,7 @@ class EgoMotion(nn.Module):
         self.blocks = nn.ModuleList(
             AttentionBlock(tokens, config.heads, config.mlp_ratio) for _ in range(config.blocks)
         )
+        self.shown = nn.Linear(2 * (len(_REST) - 1), tokens) if start == "prior" else None
         self.norm = nn.LayerNorm(tokens)
         self.motion = nn.Linear(tokens, 2 * len(_REST))
         with torch.no_grad():
@@ -71,6 +85,7 @@ class EgoMotion(nn.Module):
         depth_cur: torch.Tensor,
         mask_prev: torch.Tensor,
         mask_cur: torch.Tensor,
+        prior: tuple[RigidMotion, RigidMotion] | None = None,
     ) -> tuple[RigidMotion, RigidMotion]:
         """Forecast the camera's motion. All arguments are on the encoder's grid, h x w, of any size.
 
@@ -81,23 +96,37 @@ class EgoMotion(nn.Module):
             depth_cur: the same at t.
             mask_prev: [B, 1, h, w], 1 where the frame itself shows static background.
             mask_cur: the same at t.
+            prior: ``next_from_prev`` and ``next_from_cur`` to start from, with ``start`` "prior".
 
         Returns:
             ``next_from_prev`` and ``next_from_cur``; differentiable in all but the masks' choice of tokens.
 
         Raises:
-            ValueError: an argument of another shape.
+            ValueError: an argument of another shape, or a prior missing or not asked for.
         """
+        if (prior is None) != (self.shown is None):
+            raise ValueError(f"`prior` must be {'none' if self.shown is None else 'given'} with this `start`")
         pair = frame_pair(features_prev, features_cur, depth_prev, depth_cur, mask_prev, mask_cur, self.features)
         grid = torch.cat([self.frame(frame) for frame in pair], dim=1)
         tokens = (grid + sinusoidal_positions(grid)).flatten(2).mT
+        if prior is not None and self.shown is not None:
+            tokens = tokens + self.shown(torch.cat([_numbers(motion) for motion in prior], dim=1))[:, None]
         looked_at = background_tokens(mask_prev, mask_cur, *grid.shape[-2:])
         for block in self.blocks:
             tokens = block(tokens, looked_at)
         weights = looked_at.to(tokens.dtype) / looked_at.sum(dim=1, keepdim=True)
         mean = (weights[:, None] @ self.norm(tokens))[:, 0]
         first, second = self.motion(mean).chunk(2, dim=1)
-        return RigidMotion(first[:, :4], first[:, 4:]), RigidMotion(second[:, :4], second[:, 4:])
+        from_prev, from_cur = (RigidMotion(seven[:, :4], seven[:, 4:]) for seven in (first, second))
+        return (from_prev, from_cur) if prior is None else (from_prev.after(prior[0]), from_cur.after(prior[1]))
+
+
+def _numbers(motion: RigidMotion) -> torch.Tensor:
+    """[B, 6]: rotation vector of a small turn, 2 sign(w) v / |q|, times _TURN_SHOWN, and translation."""
+    w, vector = motion.quaternion.split([1, 3], dim=1)
+    length = torch.linalg.vector_norm(motion.quaternion, dim=1, keepdim=True).clamp(min=1e-8)
+    turn = 2 * torch.where(w < 0, -vector, vector) / length
+    return torch.cat([_TURN_SHOWN * turn, motion.translation], dim=1)
 
 
 class AttentionBlock(nn.Module):

@@ -1,6 +1,6 @@
 """The whole network: two frames in, future frames out, from any camera."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
@@ -9,14 +9,23 @@ from torch import nn
 
 from vestcl import geometry
 from vestcl.models._checkpoint import read_checkpoint, write_checkpoint
-from vestcl.models._clouds import Cloud, advance, join, lift
+from vestcl.models._clouds import Cloud, advance, as_image, join, lift
 from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame, check_frames, grid_depth, grid_mean, with_depth
 from vestcl.models._perceive import Perceive, perceive_forecast, perceive_view, straight_view
-from vestcl.models._render import Camera, RenderedView, Side, checked_camera, compose_view, splat_cloud
+from vestcl.models._render import (
+    Camera,
+    RenderedView,
+    Side,
+    checked_camera,
+    compose_view,
+    refined_channels,
+    splat_cloud,
+)
 from vestcl.models.config import LOG_DEPTH_FAR, ModelConfig
 from vestcl.models.ego_motion import EgoMotion, RigidMotion
 from vestcl.models.encoder import Encoder, upsample_features
 from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
+from vestcl.models.prior import MotionPrior, beside, check_prior, repeated
 from vestcl.models.refine import Refine
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
@@ -38,6 +47,8 @@ class Motion(NamedTuple):
     next_from_cur: RigidMotion
     flow0: torch.Tensor
     """[B, 6, H, W] m: the rigid flow of the previous frame's pixels, then of the current one's."""
+    start: torch.Tensor
+    """[B, 6, H, W] m: what object motion starts from: ``flow0``, and what the prior says of things beside it."""
     objects: ObjectMotionForecast
     """The flow that is used, each block's candidates, which ran, their probabilities; without object motion the flow
     is ``flow0`` and L = 0."""
@@ -52,7 +63,7 @@ class Step(NamedTuple):
     """The forecast of one time, t + k."""
 
     views: list[RenderedView]
-    """One for each camera asked for."""
+    """One for each camera asked for; none at steps that are not shown."""
     motion: Motion
     """Of the interval before t + k; when motion is composed, that of the first interval."""
     future_from_cur: torch.Tensor
@@ -76,15 +87,26 @@ class Forecaster(nn.Module):
         super().__init__()
         self.config, features = config, config.encoder.features
         self.encoder = Encoder(config.encoder)
-        self.ego_motion = None if config.ego_motion is None else EgoMotion(config.ego_motion, features)
+        self.ego_motion = None if config.ego_motion is None else EgoMotion(config.ego_motion, features, config.start)
         self.object_motion = None if config.object_motion is None else ObjectMotion(config.object_motion, features)
         self.refine = Refine(config.refine, config.render, features)
+        #: Encoder and refinement compute in this type (torch.bfloat16, or None for the parameters' own): motion, which
+        #: is millimetres in hundreds of metres, never does.
+        self.autocast: torch.dtype | None = None
 
     def forward(
-        self, frame_prev: LayerBatch, frame_cur: LayerBatch, K: torch.Tensor, views: Views | None = None
+        self,
+        frame_prev: LayerBatch,
+        frame_cur: LayerBatch,
+        K: torch.Tensor,
+        views: Views | None = None,
+        *,
+        prior: MotionPrior | None = None,
+        horizon: int = 1,
     ) -> Step:
-        """The next frame with everything that a loss needs: the first step of `forecast`, same arguments."""
-        return self.forecast(frame_prev, frame_cur, K, views=views)[0]
+        """Frame t + ``horizon``, motion composed, with everything that a loss needs; arguments as of `forecast`."""
+        last = {"mode": "compose", "shown": (horizon,), "prior": prior}
+        return self.forecast(frame_prev, frame_cur, K, horizon, views, **last)[-1]  # type: ignore[arg-type]
 
     def forecast(
         self,
@@ -95,6 +117,9 @@ class Forecaster(nn.Module):
         views: Views | None = None,
         mode: Mode = "feedback",
         perceive: Perceive | None = None,
+        *,
+        prior: MotionPrior | None = None,
+        shown: Collection[int] | None = None,
     ) -> list[Step]:
         """Forecast t + 1 to t + steps.
 
@@ -104,39 +129,52 @@ class Forecaster(nn.Module):
             K: [B, 3, 3] px, of both.
             steps: number of future frames.
             views: the cameras to show, as (tgt_from_next [B, 4, 4], K [B, 3, 3]), each at its own future time; None
-                is the source camera alone.
+                is the source camera alone; none at all forecasts motion, with "compose" alone.
             mode: "feedback" takes each forecast frame, as the source camera sees it, for an input of the next step;
                 no gradient passes from step to step. "compose" repeats the motion of the first step, the camera's and
                 in the world what objects have beside it, and encodes nothing anew.
             perceive: for "feedback", (image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W])
                 -> layers of that forecast frame; None is `perceive_forecast`.
+            prior: motion that was measured, for models that start from it and no others; with "feedback" each later
+                step starts from the motion of the step before.
+            shown: steps k to show, of 1 ... steps; None shows all.
 
         Returns:
             One `Step` a future frame; differentiable in parameters and images.
 
         Raises:
-            ValueError: an argument of another shape, a depth that is not above 0, less than one step, another mode.
+            ValueError: an argument of another shape, a depth that is not above 0, less than one step, another mode,
+                or a prior that is missing or not wanted.
         """
         check_frames(frame_prev, frame_cur, K)
+        if (prior is None) == (self.config.start == "prior"):
+            wanted = "a `MotionPrior`" if prior is None else "None"
+            raise ValueError(f"`prior` must be {wanted} for {self.config.name}, which starts from {self.config.start}")
+        if prior is not None:
+            check_prior(prior, frame_cur.image)
         if steps < 1 or mode not in ("feedback", "compose"):
             raise ValueError(f'`steps` must be >= 1 and `mode` "feedback" or "compose", got {steps} and {mode!r}')
         straight = Camera(torch.eye(4).to(K).expand(len(K), 4, 4), K)
         cameras = [straight] if views is None else [checked_camera(camera, len(K)) for camera in views]
         prev, cur = self.encode(frame_prev), self.encode(frame_cur)
-        motion = self.move(prev, cur, K)
-        clouds = self.lift(prev, cur, motion, K)
-        done = [Step([self.show(clouds, camera, motion, K) for camera in cameras], motion, motion.rigid)]
-        while len(done) < steps:
+        motion = self.move(prev, cur, K, prior)
+        clouds = self.lift(prev, cur, motion, K) if cameras else []
+        done, shown, future_from_cur = list[Step](), set(range(1, steps + 1) if shown is None else shown), motion.rigid
+        while True:
+            step = len(done) + 1
+            seen = [self.show(clouds, camera, motion, K) for camera in cameras] if step in shown else []
+            done.append(Step(seen, motion, future_from_cur))
+            if step == steps:
+                return done
             if mode == "compose":
                 clouds = [advance(cloud, motion.rigid) for cloud in clouds]
             else:
-                seen = straight_view(cameras, done[-1].views, straight) or self.show(clouds, straight, motion, K)
-                prev, cur = cur, self.encode(perceive_view(seen, perceive or perceive_forecast))
-                motion = self.move(prev, cur, K)
+                view = straight_view(cameras, seen, straight) or self.show(clouds, straight, motion, K)
+                prior = None if prior is None else _next_prior(motion, view, K)
+                prev, cur = cur, self.encode(perceive_view(view, perceive or perceive_forecast))
+                motion = self.move(prev, cur, K, prior)
                 clouds = self.lift(prev, cur, motion, K)
-            views_seen = [self.show(clouds, camera, motion, K) for camera in cameras]
-            done.append(Step(views_seen, motion, motion.rigid @ done[-1].future_from_cur))
-        return done
+            future_from_cur = motion.rigid @ future_from_cur
 
     # ---------------------------------------------------------------- the figure, from left to right
 
@@ -153,7 +191,9 @@ class Forecaster(nn.Module):
         layers = with_depth(frame, self.config.fixed_depth)
         batch, _, height, width = layers.image.shape
         has_foreground = (layers.mask < FOREGROUND_BELOW).flatten(1).any(dim=1)
-        grid = self.encoder(torch.cat([layers.image, layers.background_image[has_foreground]]))
+        with self._autocast():
+            grid = self.encoder(torch.cat([layers.image, layers.background_image[has_foreground]]))
+        grid = grid.to(layers.image.dtype)
         own = grid[:batch]
         features = upsample_features(own, height, width)
         if not has_foreground.any():
@@ -163,26 +203,30 @@ class Forecaster(nn.Module):
         background = grid.index_select(0, rows)
         return EncodedFrame(layers, features, background, upsample_features(background, height, width))
 
-    def move(self, prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor) -> Motion:
+    def move(self, prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, prior: MotionPrior | None = None) -> Motion:
         """The camera's motion from both frames to the next, the rigid flow that it makes, and the objects' flow.
 
         Args:
             prev: frame at t - 1.
             cur: frame at t.
             K: [B, 3, 3] px.
+            prior: what both start from.
 
         Returns:
             `Motion`; differentiable.
         """
-        to_next = self.move_camera(prev, cur)
+        to_next = self.move_camera(prev, cur, prior)
         flows = [
             rigid_flow(unproject(frame.layers.depth, K), *rigid)
             for frame, rigid in zip((prev, cur), to_next, strict=True)
         ]
-        flow0 = torch.cat(flows, dim=2).unflatten(1, cur.features.shape[2:]).permute(0, 3, 1, 2)
-        return Motion(*to_next, flow0, self.move_objects(prev, cur, to_next, flow0))
+        flow0 = as_image(torch.cat(flows, dim=2), *cur.features.shape[2:])
+        start = flow0 if prior is None or self.object_motion is None else flow0 + beside(prior, to_next)
+        return Motion(*to_next, flow0, start, self.move_objects(prev, cur, to_next, flow0, start))
 
-    def move_camera(self, prev: EncodedFrame, cur: EncodedFrame) -> tuple[RigidMotion, RigidMotion]:
+    def move_camera(
+        self, prev: EncodedFrame, cur: EncodedFrame, prior: MotionPrior | None = None
+    ) -> tuple[RigidMotion, RigidMotion]:
         """EMF on the encoder's grid: ``next_from_prev`` and ``next_from_cur``; rest where the model has none."""
         if self.ego_motion is None:
             rest = _rest(cur.features)
@@ -192,19 +236,25 @@ class Forecaster(nn.Module):
             *(frame.background_grid for frame in frames),
             *(grid_depth(frame.layers.background_depth) for frame in frames),
             *(grid_mean(frame.layers.mask) for frame in frames),
+            prior=None if prior is None else (prior.next_from_prev, prior.next_from_cur),
         )
 
     def move_objects(
-        self, prev: EncodedFrame, cur: EncodedFrame, to_next: tuple[RigidMotion, RigidMotion], flow0: torch.Tensor
+        self,
+        prev: EncodedFrame,
+        cur: EncodedFrame,
+        to_next: tuple[RigidMotion, RigidMotion],
+        flow0: torch.Tensor,
+        start: torch.Tensor,
     ) -> ObjectMotionForecast:
-        """OMF at full size, [B, 6, H, W] m in and out.
+        """OMF at full size, [B, 6, H, W] m in and out; ``start`` is what it corrects.
 
         The sky's rigid flow is hundreds of metres in any bend, which no convolution should see: with (R - I) x scaled
         to a depth of LOG_DEPTH_FAR it is as far as the networks' depth goes. What was taken off is added again.
         """
-        if self.object_motion is None:
-            none = torch.zeros(len(flow0), 0, dtype=torch.bool)
-            return ObjectMotionForecast(flow0, [], none, None)
+        if self.object_motion is None or self.object_motion.changes_nothing:
+            none = torch.zeros(len(start), 0, dtype=torch.bool)
+            return ObjectMotionForecast(start, [], none, None)
         frames = prev, cur
         beyond = torch.cat([
             (1 - LOG_DEPTH_FAR / frame.layers.depth).clamp(min=0) * (flow - rigid.translation[:, :, None, None])
@@ -214,7 +264,7 @@ class Forecaster(nn.Module):
             *(frame.features for frame in frames),
             *(frame.layers.depth for frame in frames),
             *(frame.layers.mask for frame in frames),
-            flow0 - beyond,
+            start - beyond,
         )
         candidates = [candidate + beyond for candidate in objects.candidates]
         return objects._replace(flow=objects.flow + beyond, candidates=candidates)
@@ -254,13 +304,18 @@ class Forecaster(nn.Module):
     def splat(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> list[Side]:
         """What each cloud leaves on the view; arguments as in `show`."""
         height, width = motion.flow0.shape[2:]
-        rigid, rho = motion.rigid.detach(), self.config.render.rho
-        return [splat_cloud(cloud, camera, K, rigid, rho, height, width) for cloud in clouds]
+        rigid, render = motion.rigid.detach(), self.config.render
+        return [splat_cloud(cloud, camera, K, rigid, render, height, width) for cloud in clouds]
 
     def paint(self, sides: Sequence[Side]) -> torch.Tensor:
         """The refined image [B, 3, H, W], from the channels that `RenderConfig.channels` counts."""
-        shown = 4 if self.config.render.colour else 1
-        return self.refine(torch.cat([plane for side in sides for plane in side[:shown]], dim=1))
+        render = self.config.render
+        planes = [refined_channels(side, render.colour, render.normalised) for side in sides]
+        with self._autocast():
+            return self.refine(torch.cat(planes, dim=1)).to(planes[0].dtype)
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast("cpu", self.autocast, enabled=self.autocast is not None)
 
     # ---------------------------------------------------------------- files
 
@@ -290,6 +345,12 @@ class Forecaster(nn.Module):
         except RuntimeError as error:
             raise ValueError(f"`path` must hold the weights of {config.name}, got {path} ({error})") from error
         return model.eval()
+
+
+def _next_prior(motion: Motion, seen: RenderedView, K: torch.Tensor) -> MotionPrior:
+    """Of the step after ``motion``, from which the source camera has ``seen`` the result."""
+    moved = (motion.objects.flow - motion.flow0)[:, 3:]
+    return repeated(motion.next_from_cur, moved, seen, K)
 
 
 def _rest(like: torch.Tensor) -> RigidMotion:

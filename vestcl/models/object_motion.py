@@ -96,6 +96,14 @@ class ObjectMotion(nn.Module):
         cut = [candidate[..., :height, :width] for candidate in candidates]
         return ObjectMotionForecast(flow[..., :height, :width], cut, gates.detach().bool(), probabilities)
 
+    @property
+    def changes_nothing(self) -> bool:
+        """Whether it is as it was made, dU = 0, and nothing is to learn: then U = U^0, and it need not run."""
+        if torch.is_grad_enabled() and any(parameter.requires_grad for parameter in self.parameters()):
+            return False
+        last = [block.get_submodule("out") for block in self.blocks]
+        return not any(parameter.any() for layer in last for parameter in layer.parameters())
+
     def _cascade(
         self, frames: torch.Tensor, shrunk: dict[int, torch.Tensor], flow: torch.Tensor, gates: torch.Tensor
     ) -> tuple[torch.Tensor, list[torch.Tensor]]:

@@ -1,11 +1,16 @@
 """Refinement: a U-Net that makes the image out of what the clouds left on the new view."""
 
+from typing import Final
+
 import torch
 from torch import nn
 from torch.nn import functional
 
 from vestcl.models._layers import channels_last, check, group_norm, upsample
-from vestcl.models.config import REFINE_GROUP, RefineConfig, RenderConfig
+from vestcl.models.config import LEAST_COVERAGE, REFINE_GROUP, RefineConfig, RenderConfig
+
+#: From this coverage on a side hides what is behind it: only cracks between a surface's points let it through.
+_OPAQUE: Final = 0.5
 
 
 class Refine(nn.Module):
@@ -15,9 +20,10 @@ class Refine(nn.Module):
     bilinear x2, joined with the level's second conv, conv, joined with its first conv, conv; the last up is joined
     with the stem, and a conv makes three channels. Convs are 3x3 with GroupNorm and PReLU.
 
-    Painting gives sigmoid(y). Residual gives b + y, with y exactly 0 at the start: b is the rendered colour (which
-    is premultiplied with coverage), current frame over previous frame, b = c_cur + (1 - coverage_cur) c_prev; out of
-    training it is clamped to [0, 1].
+    Without a base it paints sigmoid(y). With one it gives b + y, with y exactly 0 at the start; out of training that
+    is clamped to [0, 1]. "splatted" takes the rendered colour (premultiplied with coverage), current frame over
+    previous frame, b = c_cur + (1 - coverage_cur) c_prev. "filled" takes colours divided by coverage, opaque from
+    _OPAQUE on, the current frame over the previous one, and `fill`s what is left.
 
     Source: SPEC section 6; 3D Moments (CVPR 2022). There, four max-pools face five doublings, and the first doubled
     image is cut to its middle to fit; here the bottleneck has a max-pool of its own.
@@ -28,9 +34,9 @@ class Refine(nn.Module):
     ) -> None:
         super().__init__()
         config, self.render, self.features = config or RefineConfig(), render or RenderConfig(), features
-        if config.residual and not self.render.colour:
-            raise ValueError("`config.residual` adds to the rendered colour, so it needs `render.colour`")
-        self.residual = config.residual
+        if config.base != "none" and not self.render.colour:
+            raise ValueError("`config.base` adds to the rendered colour, so it needs `render.colour`")
+        self.base = config.base
         self.channels = self.render.channels(features)
         kernel, widths = config.stem_kernel, (config.stem, *config.widths)
         self.stem = nn.Sequential(
@@ -39,7 +45,7 @@ class Refine(nn.Module):
         self.downs = nn.ModuleList(Down(*pair) for pair in zip(widths, [*config.widths, widths[-1]], strict=True))
         self.ups = nn.ModuleList(Up(wide, narrow) for wide, narrow in zip(widths[:0:-1], widths[-2::-1], strict=True))
         self.out = nn.Conv2d(2 * config.stem, 3, 3, padding=1)
-        if self.residual:
+        if self.base != "none":
             nn.init.zeros_(self.out.weight)
             assert self.out.bias is not None
             nn.init.zeros_(self.out.bias)
@@ -69,19 +75,42 @@ class Refine(nn.Module):
         for up in self.ups:
             x = up(x, *levels.pop())
         y = self.out(torch.cat([stem, upsample(x, 2, *stem.shape[-2:])], dim=1))
-        if not self.residual:
+        if self.base == "none":
             return y.sigmoid()
-        image = self._splatted_colour(rendered) + y
+        image = self._base(rendered) + y
         return image if self.training else image.clamp(0, 1)
 
-    def _splatted_colour(self, rendered: torch.Tensor) -> torch.Tensor:
+    def _base(self, rendered: torch.Tensor) -> torch.Tensor:
         """b of the class's formula, [B, 3, H, W]."""
-        colour = slice(self.features, self.features + 3)
-        if self.render.joint:
-            return rendered[:, colour]
-        prev, cur = rendered.chunk(2, dim=1)
-        uncovered = 1 - cur[:, self.features + 3 : self.features + 4]
-        return cur[:, colour] + uncovered * prev[:, colour]
+        image, opacity = torch.zeros_like(rendered[:, :3]), torch.zeros_like(rendered[:, :1])
+        for side in rendered.chunk(1 if self.render.joint else 2, dim=1):
+            colour, coverage = side[:, self.features :].split([3, 1, 1], dim=1)[:2]
+            if self.base == "filled":
+                coverage = ((coverage - LEAST_COVERAGE) / (_OPAQUE - LEAST_COVERAGE)).clamp(0, 1)
+                colour = colour * coverage
+            image, opacity = colour + (1 - coverage) * image, coverage + (1 - coverage) * opacity
+        return fill(image, opacity) if self.base == "filled" else image
+
+
+def fill(image: torch.Tensor, opacity: torch.Tensor) -> torch.Tensor:
+    """c + (1 - a) up(fill(coarser c, coarser a)): push and pull. A coarser pixel is as opaque as the sum of its four.
+
+    Args:
+        image: c [B, C, H, W], times opacity.
+        opacity: a [B, 1, H, W] in [0, 1].
+
+    Returns:
+        [B, C, H, W], opaque; black where there is nothing in the whole picture. Differentiable.
+
+    Source: Gortler et al., The Lumigraph, 1996.
+    """
+    height, width = image.shape[2:]
+    if height == width == 1:
+        return image / opacity.clamp(min=1e-6)
+    pooled = functional.avg_pool2d(torch.cat([image, opacity], dim=1), 2, ceil_mode=True, count_include_pad=False)
+    gain = 1 / pooled[:, -1:].clamp(min=0.25)
+    coarse = fill(pooled[:, :-1] * gain, (pooled[:, -1:] * gain).clamp(max=1))
+    return image + (1 - opacity) * upsample(coarse, 2, height, width)
 
 
 class Down(nn.Module):

@@ -1,0 +1,248 @@
+"""train.evaluate: whole runs on tiny streets and on a tiny tree of KITTI raw, what they keep, and what they tell."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from forecaster_scenes import TINY, stir
+from test_train_protocols import calibration
+
+from train import evaluate, evaluate_windows
+from train.evaluate import Evaluation, main
+from train.evaluate_windows import AS_SEEN, CAMERA, CONSTANT_VELOCITY, PART_WINDOWS
+from train.protocols import NOW
+from vestcl.compare import FLOW, REPEAT
+from vestcl.data import Street
+from vestcl.data.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST
+from vestcl.io import read_pixels, write_pixels
+from vestcl.io.images import to_pixels
+from vestcl.models.forecaster import Forecaster
+from vestcl.scoring import GEOMETRIC, ORACLE, OTHER_CAMERA
+
+SIZE = 48, 160
+STREETS: dict[str, Any] = {
+    "protocol": "street", "height": SIZE[0], "width": SIZE[1], "steps": 2, "horizons": (1, 2), "samples": 1,
+    "seeds": (3, 5),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return model_file(tmp_path_factory.mktemp("model") / "tiny.safetensors", 0)
+
+
+@pytest.fixture(scope="module")
+def whole(model: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    """An unbroken run, and its folder."""
+    out = tmp_path_factory.mktemp("whole") / "new"
+    return run(**STREETS, model=(model,), out=out), out
+
+
+def model_file(path: Path, seed: int) -> Path:
+    torch.manual_seed(seed)
+    stir(Forecaster(TINY)).save(path)
+    return path
+
+
+def run(**settings: Any) -> dict[str, Any]:
+    """results.json."""
+    config = Evaluation(**settings)
+    evaluate.evaluate(config)
+    assert config.out is not None
+    told: dict[str, Any] = json.loads((config.out / "results.json").read_text(encoding="utf-8"))
+    return told
+
+
+def scores(told: dict[str, Any]) -> list[tuple[Any, ...]]:
+    """All but the time it took."""
+    rows = [(w["clip"], w["index"], w["view"], w["method"], w["scores"]) for w in told["windows"]]
+    return sorted(rows, key=lambda row: row[:4])
+
+
+def test_a_run_measures_every_method(whole: tuple[dict[str, Any], Path]) -> None:
+    told, _ = whole
+    methods = {REPEAT, FLOW, GEOMETRIC, "tiny"}
+    assert set(told["summary"]) == {"source", "right", CAMERA}
+    assert set(told["summary"]["source"]) == methods
+    left = {REPEAT + OTHER_CAMERA, FLOW + OTHER_CAMERA}
+    assert set(told["summary"]["right"]) == {GEOMETRIC, "tiny", ORACLE} | left
+    assert set(told["summary"][CAMERA]) == {CONSTANT_VELOCITY, "tiny"}
+    assert set(told["clips"]) == {"street 3", "street 4", "street 5"}
+    own = [w["scores"]["psnr"] for w in told["windows"] if (w["view"], w["method"]) == ("source", GEOMETRIC)]
+    found = told["summary"]["source"][GEOMETRIC]
+    np.testing.assert_allclose(found["by_horizon"]["psnr"], np.mean(own, axis=0))
+    np.testing.assert_allclose(found["running_mean"]["psnr"], [np.mean(own, axis=0)[0], np.mean(own)])
+    assert found["by_horizon"]["psnr"][0] > told["summary"]["source"][REPEAT]["by_horizon"]["psnr"][0]
+    interval = told["intervals"]["source"][GEOMETRIC]["psnr"][0]
+    assert interval["low"] < interval["mean"] < interval["high"]
+    assert interval["mean"] == pytest.approx(found["by_horizon"]["psnr"][0])
+    difference = told["differences"]["source"]["tiny"]["psnr"][0]
+    tiny = told["summary"]["source"]["tiny"]["by_horizon"]["psnr"][0]
+    assert difference["mean"] == pytest.approx(tiny - interval["mean"]) and difference["better"] == 0
+    assert told["models"]["tiny"]["sha256"] and {"device", "torch", "vestcl"} <= set(told["machine"])
+    assert "Depth is from the street itself, true, masks are from labels." in told["notes"]
+
+
+def test_the_files_tell_the_same(whole: tuple[dict[str, Any], Path]) -> None:
+    told, out = whole
+    with (out / "results.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == sum(len(next(iter(w["scores"].values()))) for w in told["windows"])
+    for row in rows:
+        (window,) = [w for w in told["windows"] if all(w[k] == row[k] for k in ("clip", "view", "method"))]
+        for name, values in window["scores"].items():
+            value = values[int(row["horizon"]) - 1]
+            assert float(row[name]) == value if value is not None else row[name] in ("nan", "inf")
+    text = (out / "results.md").read_text(encoding="utf-8")
+    best = told["summary"]["source"]["tiny"]["by_horizon"]["psnr"]
+    assert f"| tiny | {best[0]:.2f} | {best[1]:.2f} |" in text
+    assert "view source, model less geometric" in text and "view camera, model less constant velocity" in text
+    assert "by clip" in text and "| street 4 | 1 |" in text and "LPIPS (--lpips)" in text
+    sheets = [read_pixels(out / f"sheet_{word}.png") for word in ("best", "median", "worst")]
+    assert {sheet.shape for sheet in sheets} == {sheets[0].shape}
+    assert sheets[0].shape[0] > 2 * SIZE[0] and sheets[0].shape[1] > 5 * SIZE[1]  # two steps, five pictures each
+    assert not np.array_equal(sheets[0], sheets[2])
+
+
+def test_what_is_done_is_not_done_again(
+    whole: tuple[dict[str, Any], Path], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that dies in its second clip, and goes on: the same scores, and the first clip is not looked at again."""
+    original, seen = evaluate_windows.window, list[str]()
+
+    def window(perception: Any, truth: Any, *arguments: Any) -> Any:
+        seen.append(truth.clip.name)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return original(perception, truth, *arguments)
+
+    monkeypatch.setattr(evaluate_windows, "window", window)
+    settings = {**STREETS, "model": (model,), "out": tmp_path / "broken", "sheets": False}
+    with pytest.raises(KeyboardInterrupt):
+        run(**settings)
+    assert not (tmp_path / "broken" / "results.json").exists()
+    assert scores(run(**settings)) == scores(whole[0])
+    assert seen == ["street 3", "street 4", "street 4", "street 5"]
+
+
+def test_shares_come_together(
+    whole: tuple[dict[str, Any], Path], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {**STREETS, "model": (model,), "sheets": False}
+    evaluate.evaluate(Evaluation(**settings, out=tmp_path / "shared", shard="1/2"))
+    assert not (tmp_path / "shared" / "results.json").exists()
+    with pytest.raises(ValueError, match="`merge` needs all of them: 1 of 3 parts"):
+        run(**settings, out=tmp_path / "shared", merge=True)
+    monkeypatch.setenv("RANK", "0")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert scores(run(**settings, out=tmp_path / "shared")) == scores(whole[0])
+    assert scores(run(**settings, out=tmp_path / "shared", merge=True)) == scores(whole[0])
+
+
+def test_another_model_is_another_evaluation(tmp_path: Path) -> None:
+    model = model_file(tmp_path / "tiny.safetensors", 1)
+    settings = {**STREETS, "seeds": (3, 3), "out": tmp_path / "out", "sheets": False}
+    before = run(**settings, model=(model,))
+    model_file(model, 2)  # other weights by the same name
+    after = run(**settings, model=(model,))
+    assert before["models"]["tiny"]["sha256"] != after["models"]["tiny"]["sha256"]
+    assert before["summary"]["source"]["tiny"] != after["summary"]["source"]["tiny"]
+    assert len(list((tmp_path / "out" / "clips").iterdir())) == 2
+
+
+def test_a_part_that_holds_something_else_is_told(tmp_path: Path) -> None:
+    settings = {**STREETS, "seeds": (3, 3), "out": tmp_path, "sheets": False}
+    run(**settings)
+    (kept,) = (tmp_path / "clips").iterdir()
+    kept.write_text('{"records": [{}]}', encoding="utf-8")
+    with pytest.raises(ValueError, match=r"holds no scores .* delete it"):
+        run(**settings)
+
+
+# ---------------------------------------------------------------- KITTI raw
+
+
+def drives(root: Path, names: tuple[str, ...], frames: int = 7) -> Path:
+    """One street, seen by both cameras of KITTI's rig, as every one of the drives."""
+    clip = Street.generate(3).clip(frames, *SIZE, samples=1)
+    K, right = clip[0].K, clip[0].right
+    assert right is not None
+    flat = f"{K[0, 0]} 0 {K[0, 2] - 0.5} {{}} 0 {K[1, 1]} {K[1, 2] - 0.5} 0 0 0 1 0"
+    calibration(root, flat.format(0), flat.format(K[0, 0] * right.right_from_left[0, 3]))
+    for name in names:
+        for index, sample in enumerate(clip):
+            assert sample.right is not None
+            for camera, image in (("02", sample.read_image()), ("03", sample.right.read_image())):
+                path = root / name[:10] / name / f"image_{camera}" / "data" / f"{index:010}.png"
+                write_pixels(path, to_pixels(image).astype(np.uint8))
+    return root
+
+
+def test_the_papers_protocol_on_kitti(tmp_path: Path, model: Path) -> None:
+    data = drives(tmp_path / "kitti", KITTI_PREDICTION_TEST)
+    settings = {"data": data, "height": SIZE[0], "width": SIZE[1], "steps": 3, "model": (model,), "sheets": False}
+    told = run(protocol="kitti-space-time", out=tmp_path / "out", **settings)
+    assert set(told["clips"]) == set(KITTI_PREDICTION_TEST) and set(told["summary"]) == {"right"}
+    assert told["summary"]["right"]["tiny"]["windows"] == 4
+    assert len(told["summary"]["right"]["tiny"]["by_horizon"]["ssim"]) == 3
+    of_right = {name: of["by_horizon"]["ssim"][0] for name, of in told["summary"]["right"].items()}
+    assert of_right[GEOMETRIC] > of_right[REPEAT + OTHER_CAMERA]
+    text = (tmp_path / "out" / "results.md").read_text(encoding="utf-8")
+    paper = [row for row in told["paper"] if (row["method"], row["metric"]) == ("the paper", "ssim")]
+    assert len(paper) == 1 and f"| {paper[0]['values']['1']:.3f} |" in text.replace(" | ", " | ")
+    assert "Depth is from the stereo pair" in text and "MS-SSIM needs 176 pixels a side, got 48 x 160." in text
+    assert "Not the published protocol: size (48, 160), steps 3." in text
+
+
+def test_the_present_from_the_right(tmp_path: Path, model: Path) -> None:
+    data = drives(tmp_path / "kitti", KITTI_VIEWS_TEST)
+    settings = {"data": data, "height": SIZE[0], "width": SIZE[1], "steps": 3, "model": (model,), "sheets": False}
+    told = run(protocol="kitti-space", out=tmp_path / "out", **settings)
+    present = told["summary"][NOW]
+    assert set(present) == {AS_SEEN, GEOMETRIC} and len(present[GEOMETRIC]["by_horizon"]["ssim"]) == 1
+    assert present[GEOMETRIC]["by_horizon"]["ssim"][0] > present[AS_SEEN]["by_horizon"]["ssim"][0] + 0.1
+    assert "tiny" in told["summary"]["source"]
+    text = (tmp_path / "out" / "results.md").read_text(encoding="utf-8")
+    assert (
+        "Models can't show the present, so the right camera at t is without tiny." in text and "view right at t" in text
+    )
+
+
+# ---------------------------------------------------------------- the command line
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"steps": 0}, "`steps` must be 1 or more"),
+        ({"horizons": (3,)}, "`horizons` must be steps, 1 ... 2"),
+        ({"seeds": (5, 4)}, "`seeds` must be from a lower to a higher"),
+        ({"shard": "2/2"}, "`shard`"),
+        ({"model": (Path("a/x.safetensors"), Path("b/x.safetensors"))}, "`model` must have files with a stem"),
+        ({"protocol": "kitti-prediction"}, "`data` must be a folder"),
+        ({"first": 9, "last": 3}, "must have 12 frames and a window"),
+    ],
+)
+def test_what_cannot_be_is_told(settings: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        evaluate.evaluate(Evaluation(**({**STREETS, "out": tmp_path} | settings)))
+
+
+def test_the_command_line_tells_errors_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["street", "--model", str(tmp_path / "none.safetensors")]) == 2
+    assert "error: no model at" in capsys.readouterr().err
+
+
+def test_windows_of_long_clips_are_kept_in_parts(tmp_path: Path) -> None:
+    steps = 1
+    frames = PART_WINDOWS + 5 + steps
+    config = Evaluation("street", seeds=(3, 3), steps=steps, first=1, last=frames - 1 - steps, out=tmp_path)
+    protocol = evaluate.protocol_of(config)
+    sources = protocol.sources(evaluate._where(config, protocol))
+    parts = evaluate_windows.plan(sources, protocol, steps, 1, tmp_path, "key")
+    assert [len(part.indices) for part in parts] == [PART_WINDOWS, frames - 1 - steps - PART_WINDOWS]
+    assert [index for part in parts for index in part.indices] == list(range(1, frames - steps))

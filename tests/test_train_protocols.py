@@ -1,0 +1,148 @@
+"""train.protocols: windows by hand, and window counts on trees in the data sets' own layouts."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from data_files import picture, write_text
+
+from train.evaluate_windows import PART_WINDOWS, Part, plan
+from train.protocols import HELD_OUT, NOW, PROTOCOLS, Name, Where, currents
+from vestcl.bench.forecast import HELD_OUT as BENCH_HELD_OUT
+from vestcl.data.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, windows
+from vestcl.io import write_pixels
+from vestcl.scoring import METRICS
+
+#: Frames of the synced test drives, as KITTI raw's release has them.
+TEST_FRAMES = {"0060": 78, "0084": 383, "0093": 433, "0096": 475}
+
+#: Snippets of Cityscapes' val. It has three cities; opening a snippet lists its city, so more of them test faster.
+SNIPPETS, CITIES = 500, [f"city-{letter}" for letter in "abcdefghijklmnopqrstuvwxy"]
+
+P2 = "721.5377 0 609.5593 44.85728 0 721.5377 172.854 0.2163791 0 0 1 0.002745884"
+P3 = "721.5377 0 609.5593 -339.5242 0 721.5377 172.854 2.199936 0 0 1 0.002729905"
+
+
+def calibration(root: Path, left: str = P2, right: str = P3) -> None:
+    lines = "R_rect_00: 1 0 0 0 1 0 0 0 1", f"P_rect_02: {left}", f"P_rect_03: {right}"
+    write_text(root / "2011_09_26" / "calib_cam_to_cam.txt", *lines)
+
+
+def empty_drives(root: Path, frames: Mapping[str, int]) -> Path:
+    """Drives whose first pictures are tiny and whose others are empty: who opens them reads no more."""
+    calibration(root)
+    for number, count in frames.items():
+        for camera in ("02", "03"):
+            folder = root / "2011_09_26" / f"2011_09_26_drive_{number}_sync" / f"image_{camera}" / "data"
+            write_pixels(folder / f"{0:010}.png", picture(4, 12))
+            for index in range(1, count):
+                (folder / f"{index:010}.png").touch()
+    return root
+
+
+def parts_of(name: Name, data: Path | None, every: int = 1, seeds: range = HELD_OUT) -> list[Part]:
+    protocol = PROTOCOLS[name]
+    where = Where(data, seeds, protocol.size, 1 + (protocol.last or 1) + protocol.steps, 1)
+    return plan(protocol.sources(where), protocol, protocol.steps, every, Path("kept"), "key")
+
+
+def count(parts: list[Part]) -> int:
+    return sum(len(part.indices) for part in parts)
+
+
+def test_windows_by_hand() -> None:
+    assert list(currents(9, 5, 3)) == [3]
+    assert list(currents(11, 5, 3)) == [3, 4, 5]
+    assert list(currents(8, 5, 3)) == []
+    assert list(currents(30, 10, None)) == [19]
+    assert list(currents(12, 5, 2, 4)) == [2, 3, 4]
+    assert list(currents(6, 5, None)) == [] and list(currents(7, 5, None)) == [1]
+
+
+@pytest.mark.parametrize(("steps", "first"), [(0, 3), (5, 0)])
+def test_windows_need_a_frame_before_and_after(steps: int, first: int) -> None:
+    with pytest.raises(ValueError, match="`steps` and `first` must be 1 or more"):
+        currents(20, steps, first)
+
+
+def test_they_are_the_windows_of_the_split() -> None:
+    assert [window.context[-1] for window in windows(20)] == list(currents(20, 5, PROTOCOLS["kitti-prediction"].first))
+
+
+@pytest.mark.parametrize("name", ["kitti-prediction", "kitti-space-time"])
+def test_windows_of_the_kitti_test_drives(tmp_path: Path, name: Name) -> None:
+    parts = parts_of(name, empty_drives(tmp_path, TEST_FRAMES))
+    assert count(parts) == sum(frames - 8 for frames in TEST_FRAMES.values()) == 1337
+    assert {part.source.name for part in parts} == set(KITTI_PREDICTION_TEST)
+    assert parts[0].indices[0] == 3 and parts[-1].indices[-1] == TEST_FRAMES["0096"] - 6
+    assert max(len(part.indices) for part in parts) == PART_WINDOWS
+    assert len({part.file for part in parts}) == len(parts)
+
+
+def test_every_counts_through_all_clips(tmp_path: Path) -> None:
+    data = empty_drives(tmp_path, {"0060": 12, "0084": 12, "0093": 12, "0096": 12})
+    parts = parts_of("kitti-prediction", data, every=3)
+    assert [part.indices for part in parts] == [(3, 6), (5,), (4,), (3, 6)]
+
+
+def test_drives_of_the_pair_in_space_and_in_time(tmp_path: Path) -> None:
+    frames = {"0001": 108, "0057": 9, "0084": 10, "0106": 12}
+    parts = parts_of("kitti-space", empty_drives(tmp_path, frames))
+    assert {part.source.name for part in parts} == set(KITTI_VIEWS_TEST)
+    assert count(parts) == sum(n - 8 for n in frames.values())
+
+
+def test_missing_drives_are_told(tmp_path: Path) -> None:
+    empty_drives(tmp_path, {"0060": 9, "0093": 9})
+    with pytest.raises(ValueError, match="without 2011_09_26_drive_0084_sync, 2011_09_26_drive_0096_sync"):
+        parts_of("kitti-prediction", tmp_path)
+    with pytest.raises(ValueError, match="`data` must be a folder"):
+        parts_of("kitti-prediction", None)
+
+
+def test_clips_without_a_window_are_told(tmp_path: Path) -> None:
+    data = empty_drives(tmp_path, {"0060": 9, "0084": 9, "0093": 8, "0096": 9})
+    with pytest.raises(ValueError, match="0093_sync: must have 9 frames and a window from `first` to `last`, got 8"):
+        parts_of("kitti-prediction", data)
+
+
+def test_snippets_of_cityscapes_val(tmp_path: Path) -> None:
+    camera = {"intrinsic": {"fx": 2262.5, "fy": 2265.3, "u0": 1096.9, "v0": 513.1}, "extrinsic": {"baseline": 0.2093}}
+    write_pixels(tmp_path / "tiny.png", picture(4, 8))
+    tiny, told = (tmp_path / "tiny.png").read_bytes(), json.dumps(camera)
+    for city in CITIES:
+        folders = [tmp_path / kind / "val" / city for kind in ("leftImg8bit_sequence", "camera")]
+        for folder in folders:
+            folder.mkdir(parents=True)
+        for sequence in range(SNIPPETS // len(CITIES)):
+            stem = f"{city}_{sequence:06}"
+            (folders[1] / f"{stem}_000019_camera.json").write_text(told, encoding="utf-8")
+            (folders[0] / f"{stem}_000000_leftImg8bit.png").write_bytes(tiny)
+            for frame in range(1, 30):
+                (folders[0] / f"{stem}_{frame:06}_leftImg8bit.png").touch()
+    parts = parts_of("cityscapes-prediction", tmp_path)
+    assert count(parts) == len(parts) == SNIPPETS
+    assert {part.indices for part in parts} == {(19,)}  # the annotated frame, with ten after it
+    assert len({part.source.name for part in parts}) == SNIPPETS
+
+
+def test_no_snippets_are_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="leftImg8bit_sequence/val/CITY"):
+        parts_of("cityscapes-prediction", tmp_path)
+
+
+def test_streets_are_held_out() -> None:
+    parts = parts_of("street", None)
+    assert [part.source.name for part in parts] == [f"street {seed}" for seed in HELD_OUT]
+    assert {part.indices for part in parts} == {(2,)} and count(parts) == len(HELD_OUT)
+    assert not set(HELD_OUT) & set(BENCH_HELD_OUT)
+
+
+def test_the_papers_rows_are_of_what_is_measured() -> None:
+    for protocol in PROTOCOLS.values():
+        views = {*protocol.views, *([NOW] if protocol.now else [])}
+        for row in protocol.paper:
+            assert row.view in views and row.metric in METRICS
+            assert set(row.values) == ({0} if row.view == NOW else set(protocol.shown))
+            assert all(0 < value < 1 for value in row.values.values())

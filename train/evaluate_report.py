@@ -1,0 +1,251 @@
+"""What an evaluation leaves: tables, results.md, results.csv and results.json."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+from train.evaluate_statistics import Difference, Interval, differences, intervals, unit
+from train.evaluate_windows import CONSTANT_VELOCITY
+from train.protocols import PAPER_NOTE, Protocol
+from vestcl.scoring import (
+    GEOMETRIC,
+    METRICS,
+    Grid,
+    Record,
+    by_method,
+    by_view,
+    finite,
+    horizon,
+    means,
+    number,
+    picture_grids,
+    steps_of,
+    summarise,
+    to_markdown,
+)
+
+#: What models are held against: the forecast without weights and, for the camera's motion, where that takes it from.
+_BASELINES: Final = (GEOMETRIC, CONSTANT_VELOCITY)
+
+#: Clips of a table a clip; more go to results.json alone.
+CLIP_ROWS: Final = 60
+
+#: The first of each that there is stands for likeness and for distance where a table has room for no more.
+LIKENESS: Final = ("ms_ssim", "ssim", "psnr")
+DISTANCE: Final = ("lpips", "squeeze")
+
+
+@dataclass(frozen=True)
+class Results:
+    """An evaluation that is done."""
+
+    protocol: Protocol
+    records: Sequence[Record]
+    horizons: tuple[int, ...]
+    """That tables show."""
+    models: tuple[str, ...]
+    """As methods are called."""
+    told: tuple[str, ...] = ()
+    """What was given to methods and what was not measured, a sentence each."""
+
+    @property
+    def compared(self) -> tuple[str, ...]:
+        """The methods that narrow tables show."""
+        return (GEOMETRIC, *self.models)
+
+
+def headline(records: Sequence[Record]) -> list[str]:
+    """Likeness and distance, as far as the records have them."""
+    known = {metric for record in records for metric in record.scores}
+    if not known & {*LIKENESS, *DISTANCE}:
+        return [metric for metric in METRICS if metric in known]
+    return [next(m for m in choice if m in known) for choice in (LIKENESS, DISTANCE) if known & {*choice}]
+
+
+# ---------------------------------------------------------------- tables
+
+
+def grids(results: Results) -> list[Grid]:
+    """All tables: by horizon, differences, the paper's, running means, intervals, by clip."""
+    name, records, horizons = results.protocol.title, results.records, results.horizons
+    pictures = [record for record in records if record.first == 1 and "psnr" in record.scores]
+    return [
+        *short_grids(results),
+        *picture_grids(name, pictures, [k for k in horizons if k > 1], running=True),
+        *(_interval_grid(view, of_view, results) for view, of_view in by_view(records).items()),
+        *_clip_grids(results),
+    ]
+
+
+def short_grids(results: Results) -> list[Grid]:
+    """Those that a terminal has room for: by horizon, differences, the paper's."""
+    name = results.protocol.title
+    shown = picture_grids(name, results.records, results.horizons)
+    return [*shown, *_difference_grids(results), *_paper_grids(results)]
+
+
+def _interval_grid(view: str, records: Sequence[Record], results: Results) -> Grid:
+    steps, metrics = steps_of(records, results.horizons), headline(records)
+    rows = []
+    for (_, method), own in by_method(records).items():
+        found = intervals(own)
+        cells = [_cell(found[m][k - own[0].first], METRICS[m].digits) for m in metrics for k in steps]
+        rows.append((method, *cells))
+    heading = ("", *(f"{METRICS[m].label} {horizon(k)}" for m in metrics for k in steps))
+    return Grid(f"{results.protocol.title}, view {view}, mean and 95 % interval", heading, tuple(rows), _drawn(records))
+
+
+def _difference_grids(results: Results) -> list[Grid]:
+    made = []
+    for view, of_view in by_view(results.records).items():
+        methods = {method: own for (_, method), own in by_method(of_view).items()}
+        baseline = next((name for name in methods if name in _BASELINES), None)
+        steps, rows = steps_of(of_view, results.horizons), list[tuple[str, ...]]()
+        for model in (name for name in results.models if name in methods and baseline):
+            for metric, found in differences(methods[model], methods[str(baseline)]).items():
+                shown = [found[k - of_view[0].first] for k in steps]
+                cells = (f"{_cell(d.interval, '+' + METRICS[metric].digits)}, {d.better:.0%}" for d in shown)
+                rows.append((f"{model}, {METRICS[metric].label}", *cells))
+        if rows:
+            title = f"{results.protocol.title}, view {view}, model less {baseline}"
+            notes = ("Each: mean difference, its 95 % interval, share of windows where the model is better.",)
+            heading = ("", *map(horizon, steps))
+            made.append(Grid(title, heading, tuple(rows), (*notes, *_drawn(of_view))))
+    return made
+
+
+def _clip_grids(results: Results) -> list[Grid]:
+    """A row a clip."""
+    made = []
+    for view, of_view in by_view(results.records).items():
+        clips = list(dict.fromkeys(record.clip for record in of_view))
+        own = [record for record in of_view if record.method in (*results.compared, *_BASELINES)]
+        if not 1 < len(clips) <= CLIP_ROWS or not own:
+            continue
+        methods, metrics = list(dict.fromkeys(record.method for record in own)), headline(own)
+        steps = sorted({steps_of(own, results.horizons)[i] for i in (0, -1)})
+        rows = []
+        for clip in clips:
+            cells = [_of_clip(own, clip, method, m, k) for method in methods for m in metrics for k in steps]
+            count = len({record.index for record in own if record.clip == clip})
+            rows.append((clip, str(count), *cells))
+        columns = (f"{method} {METRICS[m].label} {horizon(k)}" for method in methods for m in metrics for k in steps)
+        made.append(Grid(f"{results.protocol.title}, view {view}, by clip", ("", "windows", *columns), tuple(rows)))
+    return made
+
+
+def _of_clip(records: Sequence[Record], clip: str, method: str, metric: str, step: int) -> str:
+    own = [record for record in records if (record.clip, record.method) == (clip, method)]
+    return number(means([record.scores for record in own])[metric][step - own[0].first], METRICS[metric].digits)
+
+
+def _paper_grids(results: Results) -> list[Grid]:
+    rows = results.protocol.paper
+    if not rows:
+        return []
+    steps = list(dict.fromkeys(k for row in rows for k in row.values))
+    metrics = [metric for metric in METRICS if any(row.metric == metric for row in rows)]
+    lines = []
+    for method, view in dict.fromkeys((row.method, row.view) for row in rows):
+        values = {(row.metric, k): v for row in rows if (row.method, row.view) == (method, view)
+                  for k, v in row.values.items()}  # fmt: skip
+        cells = (f"{values[m, k]:.3f}" if (m, k) in values else "-" for m in metrics for k in steps)
+        lines.append((f"{method}, view {view}", *cells))
+    heading = ("", *(f"{METRICS[m].label} {horizon(k)}" for m in metrics for k in steps))
+    return [Grid(f"{results.protocol.title}, the paper", heading, tuple(lines), (PAPER_NOTE,))]
+
+
+def _cell(interval: Interval, digits: str) -> str:
+    """ "0.812 [0.801, 0.823]" """
+    mean, low, high = (number(value, digits) for value in interval)
+    return "-" if mean == "-" else f"{mean} [{low}, {high}]"
+
+
+def _drawn(records: Sequence[Record]) -> tuple[str, ...]:
+    count = len({record.clip for record in records})
+    if unit(records) == "clips":
+        return (f"Intervals: bootstrap over {count} clips, with all of their windows.",)
+    return ("Intervals: bootstrap over the windows of one clip. They resemble each other, so it is too narrow.",)
+
+
+# ---------------------------------------------------------------- files
+
+
+def markdown(results: Results, about: Sequence[str]) -> str:
+    """results.md.
+
+    Args:
+        results: all windows.
+        about: lines on models, device and settings.
+    """
+    head = [f"# {results.protocol.title}", "", *(f"- {line}" for line in (*about, *results.told)), ""]
+    return "\n".join([*head, *map(to_markdown, grids(results))])
+
+
+def table_of_windows(records: Sequence[Record]) -> str:
+    """results.csv: a row a window, view, method and horizon; empty where a view has no such metric."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["clip", "frame", "t", "view", "method", "horizon", "seconds", *METRICS])
+    for record in records:
+        where = record.clip, record.frame, record.index, record.view, record.method
+        for step in range(len(next(iter(record.scores.values())))):
+            values = (record.scores[metric][step] if metric in record.scores else "" for metric in METRICS)
+            writer.writerow([*where, step + record.first, record.seconds, *values])
+    return text.getvalue()
+
+
+def as_json(results: Results, about: Mapping[str, Any]) -> dict[str, Any]:
+    """results.json: everything.
+
+    Args:
+        results: all windows.
+        about: machine, settings, models.
+    """
+    groups, by_clip = by_method(results.records), dict[str, Any]()
+    for clip in dict.fromkeys(record.clip for record in results.records):
+        by_clip[clip] = summarise([record for record in results.records if record.clip == clip])
+    told: dict[str, Any] = {
+        **about,
+        "title": results.protocol.title,
+        "notes": results.told,
+        "summary": summarise(results.records),
+        "intervals": _nested({key: _plain(intervals(own)) for key, own in groups.items()}),
+        "differences": _nested({key: _plain(found) for key, found in _all_differences(results).items()}),
+        "clips": by_clip,
+        "paper": [asdict(row) for row in results.protocol.paper],
+        "windows": [asdict(record) for record in results.records],
+    }
+    checked: dict[str, Any] = finite(told)
+    return checked
+
+
+def _all_differences(results: Results) -> dict[tuple[str, str], dict[str, list[Difference]]]:
+    """Of each model from the geometric forecast, or from constant velocity."""
+    groups = by_method(results.records)
+    found = {}
+    for (view, method), own in groups.items():
+        for baseline in _BASELINES:
+            if method in results.models and (view, baseline) in groups:
+                found[view, method] = differences(own, groups[view, baseline])
+    return found
+
+
+def _plain(by_metric: Mapping[str, Sequence[Interval | Difference]]) -> dict[str, list[dict[str, float]]]:
+    """Intervals and differences by their parts' names."""
+
+    def plain(value: Interval | Difference) -> dict[str, float]:
+        if isinstance(value, Interval):
+            return value._asdict()
+        return value.interval._asdict() | {"better": value.better}
+
+    return {metric: [plain(value) for value in of_steps] for metric, of_steps in by_metric.items()}
+
+
+def _nested(groups: Mapping[tuple[str, str], Any]) -> dict[str, Any]:
+    nested: dict[str, Any] = {}
+    for (view, method), value in groups.items():
+        nested.setdefault(view, {})[method] = value
+    return nested

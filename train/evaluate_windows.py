@@ -1,0 +1,296 @@
+"""Forecast windows and score them: in parts that are kept on disk, so that a killed run goes on and several share one.
+
+A part is a run of consecutive windows of one clip. Its file is named by clip, first window and a key of all that its
+numbers depend on; it is there whole or not at all.
+"""
+
+import dataclasses
+import functools
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, TypeVar
+
+import numpy as np
+
+from train.protocols import NOW, Protocol, Source, currents
+from vestcl.data.sample import Clip
+from vestcl.forecast import Forecast, Rendered, View
+from vestcl.geometric import Perception, forecast_frames
+from vestcl.geometric.forecast import _clouds, _render
+from vestcl.io.atomic import read_bytes, write_bytes
+from vestcl.models.forecaster import Forecaster, Mode
+from vestcl.models.trunks import Trunk
+from vestcl.network import forecast_frames as network_forecast_frames
+from vestcl.perceptual import Lpips
+from vestcl.scoring import (
+    GEOMETRIC,
+    OTHER_CAMERA,
+    RIGHT,
+    SOURCE,
+    Forecasts,
+    Prediction,
+    Record,
+    Timed,
+    Truth,
+    ego_errors,
+    predictions,
+    score,
+    true_motion,
+)
+from vestcl.views import parse_view, parse_views
+
+#: Windows of a part: a minute or so of work, which is what a killed run may lose, and few enough parts to list.
+PART_WINDOWS: Final = 32
+
+#: The "view" whose scores are errors of the camera's forecast motion, and the geometric method's name there.
+CAMERA: Final = "camera"
+CONSTANT_VELOCITY: Final = "constant velocity"
+
+Made = TypeVar("Made")
+
+Presenter = Callable[[Perception, int, Sequence[View]], dict[str, Rendered]]
+"""(perception, t, cameras) -> frame t by the cameras' names."""
+
+#: Where depth comes from, by its reader.
+_DEPTHS: Final = {
+    "VelodyneScan": "laser scans, densified",
+    "StreetDepth": "the street itself, true",
+    "DisparityFile": "disparity files",
+}
+
+#: Baseline of the right camera's present: what the source camera sees.
+AS_SEEN: Final = f"unchanged{OTHER_CAMERA}"
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """All that a window's scores depend on, besides its frames."""
+
+    protocol: Protocol
+    size: tuple[int, int]
+    """(height, width) px of what is forecast and scored."""
+    steps: int
+    models: Mapping[str, Forecaster]
+    """By the name that tables give them."""
+    mode: Mode = "compose"
+    stereo: bool = False
+    """Depth from the stereo pair although the clip has depth."""
+    trunk: Trunk | None = None
+    """SqueezeNet 1.0."""
+    lpips: Lpips | None = None
+
+
+@dataclass(frozen=True)
+class Part:
+    """Windows of one clip that are done in one go."""
+
+    source: Source
+    indices: tuple[int, ...]
+    """Current frames t, in order."""
+    file: Path
+    """Where the scores are kept."""
+
+
+def plan(sources: Iterable[Source], protocol: Protocol, steps: int, every: int, folder: Path, key: str) -> list[Part]:
+    """All parts, in the order of clips and windows; of all clips' windows counted through, every ``every``-th.
+
+    Args:
+        sources: clips.
+        protocol: which windows, see `train.protocols.currents`.
+        steps: frames that are forecast.
+        every: 1 takes all.
+        folder: of the parts' files.
+        key: of the settings.
+
+    Raises:
+        ValueError: ``every`` below 1, or a clip that is too short for a single window.
+    """
+    if every < 1:
+        raise ValueError(f"`every` must be 1 or more, got {every}")
+    parts, count = list[Part](), 0
+    for source in sources:
+        frames = len(source.opens())
+        known = currents(frames, steps, protocol.first, protocol.last)
+        if not known:
+            wanted = f"{(protocol.first or 1) + steps + 1} frames and a window from `first` to `last`"
+            raise ValueError(f"{source.name}: must have {wanted}, got {frames} frames")
+        chosen = [t for number, t in enumerate(known, start=count) if number % every == 0]
+        count += len(known)
+        name = re.sub(r"[^A-Za-z0-9_.-]+", "_", source.name)
+        for at in range(0, len(chosen), PART_WINDOWS):
+            indices = tuple(chosen[at : at + PART_WINDOWS])
+            parts.append(Part(source, indices, folder / f"{name}-{indices[0]:06d}-{key}.json"))
+    return parts
+
+
+def run_part(part: Part, setup: Setup, advance: Callable[[], None] = lambda: None) -> None:
+    """Forecast and score a part's windows, and write its file.
+
+    Args:
+        part: of `plan`.
+        setup: as the part's key tells.
+        advance: called after each window.
+
+    Raises:
+        ValueError: as the readers and forecasts.
+    """
+    clip = prepared(part.source.opens(), setup)
+    perception = Perception(clip)
+    truth = Truth(clip, setup.size, setup.trunk, setup.lpips)
+    records: list[Record] = []
+    for index in part.indices:
+        truth.forget(index - 1)
+        records += window(perception, truth, index, setup)
+        advance()
+    content = {"windows": len(part.indices), "records": [dataclasses.asdict(record) for record in records]}
+    write_bytes(part.file, json.dumps(content).encode())
+
+
+def read_part(part: Part) -> list[Record] | None:
+    """What `run_part` wrote; None where the part is not done.
+
+    Raises:
+        ValueError: the file holds something else.
+    """
+    if not part.file.is_file():
+        return None
+    try:
+        return [Record(**record) for record in json.loads(read_bytes(part.file))["records"]]
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{part.file}: holds no scores ({error}); delete it to have them made anew") from error
+
+
+def prepared(clip: Clip, setup: Setup) -> Clip:
+    """The clip at the size that is evaluated; with ``stereo`` without depth of its own."""
+    resized = clip.resized(*setup.size)
+    if not setup.stereo:
+        return resized
+    bare = tuple(dataclasses.replace(sample, depth=None) for sample in resized)
+    return dataclasses.replace(resized, samples=bare)
+
+
+def views_of(clip: Clip, setup: Setup) -> list[View]:
+    """The protocol's cameras that the clip has.
+
+    Raises:
+        ValueError: it has none of them.
+    """
+    there = [name for name in setup.protocol.views if name != RIGHT or clip[0].right is not None]
+    if not there:
+        raise ValueError(f"{clip.name}: must have a right camera for this protocol, got none")
+    return parse_views(there, clip)
+
+
+def known_of(clip: Clip) -> str:
+    """A sentence on what all methods but the baselines are given beside frames t-1 and t.
+
+    Args:
+        clip: as `prepared` gives it.
+    """
+    sample = clip[0]
+    if sample.depth is not None:
+        depth = _DEPTHS.get(type(sample.depth).__name__, "files")
+    else:
+        depth = "motion" if sample.right is None else "the stereo pair at t-1 and t"
+    labelled = sum(sample.labels is not None for sample in clip)
+    masks = (
+        "motion" if not labelled else "labels" if labelled == len(clip) else "labels where there are any, else motion"
+    )
+    return f"Depth is from {depth}, masks are from {masks}."
+
+
+# ---------------------------------------------------------------- a window
+
+
+def window(perception: Perception, truth: Truth, index: int, setup: Setup) -> list[Record]:
+    """Every method's scores on one window.
+
+    Args:
+        perception: of the truth's clip.
+        truth: of the clip as `prepared` gives it.
+        index: the current frame t.
+        setup: methods, views and steps.
+
+    Returns:
+        A record a view and method, and of `CAMERA` where the clip has poses.
+    """
+    clip = truth.clip
+    views = views_of(clip, setup)
+    forecasts = forecast(perception, index, views, setup)
+    shown = predictions(truth, index, setup.steps, views, forecasts)
+    records = score(truth, index, views, shown, forecasts[GEOMETRIC].forecast)
+    if setup.protocol.now:
+        records += _now(perception, truth, index, setup)
+    motion = true_motion(clip, index, setup.steps)
+    if motion is not None:
+        for name, made in forecasts.items():
+            method = CONSTANT_VELOCITY if name == GEOMETRIC else name
+            errors = ego_errors(made.forecast, motion)
+            records.append(Record(clip.name, clip[index].name, index, CAMERA, method, math.nan, errors))
+    return records
+
+
+def forecast(perception: Perception, index: int, views: Sequence[View], setup: Setup) -> Forecasts:
+    """The geometric forecast, then each model's. All use what the first has seen, and are charged for it.
+
+    Args:
+        perception: of the clip.
+        index: the current frame t.
+        views: cameras.
+        setup: models, mode and steps.
+    """
+    plain, whole = _timed(lambda: forecast_frames(perception, index, setup.steps, views))
+    looking = max(whole - plain.seconds["render"], 0.0)
+    made = {GEOMETRIC: Timed(plain, whole)}
+    for name, model in setup.models.items():
+        given = (perception, model, index, setup.steps, views)
+        own, seconds = _timed(functools.partial(network_forecast_frames, *given, mode=setup.mode))
+        made[name] = Timed(own, looking + seconds)
+    return made
+
+
+def presenters(setup: Setup) -> dict[str, Presenter]:
+    """The methods that can show frame t itself as other cameras see it. `Forecaster` has no such call: no model can.
+
+    Args:
+        setup: methods.
+    """
+    return {GEOMETRIC: show_now}
+
+
+def show_now(perception: Perception, index: int, views: Sequence[View]) -> dict[str, Rendered]:
+    """Frame t itself as other cameras see it: the geometric forecast's clouds, moved by nothing.
+
+    Args:
+        perception: of the clip.
+        index: the current frame t.
+        views: cameras at t, ``tgt_from_next`` from the source camera there.
+
+    Returns:
+        By the views' names.
+    """
+    clip = perception.clip
+    clouds = [cloud(0, [np.eye(4)]) for cloud in _clouds(perception, index)]
+    return {view.name: _render(clouds, clip[index].K if view.K is None else view.K, view, clip) for view in views}
+
+
+def _now(perception: Perception, truth: Truth, index: int, setup: Setup) -> list[Record]:
+    """The right camera's picture at t, by who can show it, and beside it what the source camera sees."""
+    clip = truth.clip
+    view = dataclasses.replace(parse_view(RIGHT, clip), name=NOW)
+    methods = {AS_SEEN: Prediction([truth.full(parse_view(SOURCE, clip), index)], 0.0)}
+    made = {name: _timed(functools.partial(by, perception, index, [view])) for name, by in presenters(setup).items()}
+    methods |= {name: Prediction([shown[NOW].image], seconds) for name, (shown, seconds) in made.items()}
+    return score(truth, index, [view], {NOW: methods}, Forecast(GEOMETRIC, [], [made[GEOMETRIC][0]]), first=0)
+
+
+def _timed(make: Callable[[], Made]) -> tuple[Made, float]:
+    """What ``make`` gives, and its seconds."""
+    start = time.perf_counter()
+    made = make()
+    return made, time.perf_counter() - start

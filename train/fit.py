@@ -1,0 +1,242 @@
+"""Train a model: ``python -m train.fit train/configs/vest-s_street.yaml data.train='[cache/*]' out=runs/first``.
+
+From frames to the loss everything is differentiable, the OpenCL splatting included. A run can be killed at any moment:
+``--resume`` goes on from its last checkpoint to the same weights. Under torchrun processes share each batch.
+"""
+
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+import torch
+import tyro
+from rich.console import Console
+
+from train import checkpoint, resume
+from train.checkpoint import CheckpointError, State
+from train.config import Config, DataConfig, load_config, to_dict
+from train.data import WindowSet, loader
+from train.losses import build_perceptual
+from train.ranks import Ranks
+from train.report import Reporter
+from train.trainer import Average, NotANumberError, Trainer, build_model
+from vestcl import runtime
+from vestcl.models.forecaster import Forecaster
+from vestcl.prepared import find_prepared
+
+#: The exit status of a run that was told to stop (SIGTERM), as a shell has it.
+STOPPED: Final = 128 + signal.SIGTERM
+
+
+class TrainingError(RuntimeError):
+    """Training can't go on; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train a model as a configuration says."""
+
+    config: tyro.conf.Positional[Path]
+    """YAML file."""
+    overrides: tyro.conf.Positional[tuple[str, ...]] = ()
+    """key=value or key.sub=value each; values are YAML."""
+    resume: bool = False
+    """Go on from the run's last checkpoint, if it has one."""
+    device: str | None = None
+    """OpenCL device: an index of `vestcl devices` or a part of its name."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command; its exit status."""
+    options = tyro.cli(Options, args=arguments, description=__doc__, prog="python -m train.fit")
+    ranks = Ranks.join()
+    console = Console(stderr=not ranks.first)
+    try:
+        config = load_config(options.config, options.overrides)
+        finished = fit(config, go_on=options.resume or ranks.restarted, ranks=ranks, device=options.device)
+        return 0 if finished else STOPPED
+    except (ValueError, OSError, runtime.DeviceError, TrainingError, CheckpointError) as error:
+        console.print(f"error: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
+        return 1
+    finally:
+        ranks.leave()
+
+
+def fit(config: Config, *, go_on: bool = False, ranks: Ranks | None = None, device: str | None = None) -> bool:
+    """Train to the end of the last stage, or until SIGTERM.
+
+    Args:
+        config: of the run.
+        go_on: from the last checkpoint of ``config.out``, if there is one.
+        ranks: the processes that train together; None is this one alone.
+        device: OpenCL device; None is `Ranks.device`'s choice.
+
+    Returns:
+        Whether the run is finished; False after SIGTERM, with a checkpoint of where it was.
+
+    Raises:
+        ValueError: data or weights that can't be used, a run that exists already, or another one's checkpoint.
+        TrainingError: a loss or gradient that is no number.
+        CheckpointError: the last checkpoint can't be written, or none can be read.
+    """
+    ranks = ranks or Ranks()
+    state = _last_state(config, go_on)
+    if config.run.threads:
+        torch.set_num_threads(config.run.threads)
+    with runtime.use(device or ranks.device()), _stop_signal() as stop:
+        return _Run(config, ranks, stop).go(state)
+
+
+def _last_state(config: Config, go_on: bool) -> State | None:
+    if not go_on:
+        if checkpoint.list_checkpoints(config.out):
+            raise ValueError(f"`out` {config.out} has a run already: --resume goes on with it, or take another folder")
+        return None
+    state = checkpoint.load_latest(config.out)
+    if state is not None:
+        resume.check_resume(state, config)
+    return state
+
+
+class _Stop:
+    """Set by SIGTERM: the update that is being made is still made."""
+
+    asked = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        self.asked = True
+
+
+@contextmanager
+def _stop_signal() -> Iterator[_Stop]:
+    stop = _Stop()
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+class _Run:
+    """The model and its running mean, through all stages."""
+
+    def __init__(self, config: Config, ranks: Ranks, stop: _Stop) -> None:
+        self.config, self.ranks, self.stop = config, ranks, stop
+        self.model: Forecaster = build_model(config)
+        self.average = Average(self.model, config.optimiser.ema) if config.optimiser.ema else None
+        self.perceptual = build_perceptual(config.loss)
+        self.step = 0
+
+    def go(self, state: State | None) -> bool:
+        """From ``state`` to the end; whether that was reached."""
+        if state is not None:
+            self._restore(state)
+        self.report = Reporter(self.config, self.step, Console(), self.ranks.first)
+        self.report.say(self._about())
+        with self.report.bar(self.step):
+            while self.step < self.config.steps:
+                position = self.config.position(self.step)
+                trainer = Trainer(self.config, position.stage, self.model, self.perceptual, self.ranks)
+                if state is not None and position.step:
+                    trainer.restore(state.optimiser, state.scheduler)
+                state = None
+                if not self._train(trainer, position.number, position.step):
+                    self.report.say(f"stopped after step {self.step}; --resume goes on")
+                    return False
+        self.report.say(f"finished: {self.config.out}")
+        return True
+
+    def _train(self, trainer: Trainer, number: int, done: int) -> bool:
+        """The rest of a stage, of which ``done`` updates are made; whether it was finished."""
+        stage = trainer.stage
+        windows = window_set(self.config.data_of(stage))
+        steps = range(done, stage.steps)
+        batches = loader(
+            windows, self.config.seed + number, stage.batch, steps, rank=self.ranks.rank, world=self.ranks.world,
+            workers=self.config.data_of(stage).workers,
+        )  # fmt: skip
+        waiting = time.perf_counter()
+        for batch in batches:
+            waited, rate = time.perf_counter() - waiting, trainer.schedule.get_last_lr()[0]
+            try:
+                update = trainer.update(batch)
+            except NotANumberError as error:
+                raise TrainingError(self._broken(str(error), batch.clips)) from error
+            self.step += 1
+            if self.average and not update.skipped:
+                self.average.update(self.model)
+            self.report.updated(self.step, stage.name, rate, update, waited, batch)
+            stopping = self.ranks.any(self.stop.asked)
+            if stopping or self.step % self.config.run.checkpoint_every == 0 or self.step == self.config.steps:
+                self._save(trainer, must=stopping or self.step == self.config.steps)
+            if stopping and self.step < self.config.steps:
+                return False
+            waiting = time.perf_counter()
+        return True
+
+    def _save(self, trainer: Trainer, must: bool) -> None:
+        """Write a checkpoint; without ``must`` a full disk is told of, and training goes on."""
+        if not self.ranks.first:
+            return
+        adam, schedule = trainer.state()
+        ema = self.average.model.state_dict() if self.average else None
+        count = self.average.count if self.average else 0
+        state = State(
+            self.step, to_dict(self.config), self.model.config, self.model.state_dict(), ema, adam, schedule,
+            extra={"averaged": count},
+        )  # fmt: skip
+        try:
+            checkpoint.save(self.config.out, state, self.config.run.keep)
+        except CheckpointError as error:
+            if must:
+                raise
+            self.report.say(f"step {self.step}: {error}", "red")
+
+    def _restore(self, state: State) -> None:
+        self.step = state.step
+        self.model.load_state_dict(dict(state.model))
+        if self.average and state.ema is not None:
+            self.average.restore(dict(state.ema), state.extra["averaged"])
+        checkpoint.restore_rng(state.rng)
+
+    def _broken(self, what: str, clips: tuple[str, ...]) -> str:
+        good = checkpoint.list_checkpoints(self.config.out)
+        last = f"the last good checkpoint is {good[0]}" if good else "there is no checkpoint yet"
+        return (
+            f"step {self.step + 1}: a loss or gradient is not a number ({what}) with {', '.join(clips)}; {last}. "
+            "`run.on_nan=skip` leaves such steps out; a lower learning rate or `run.precision=float32` may prevent them"
+        )
+
+    def _about(self) -> str:
+        count = sum(parameter.numel() for parameter in self.model.parameters())
+        begin = f"from step {self.step} " if self.step else ""
+        return (
+            f"{self.config.name}: {self.config.model}, {count:,} parameters, {begin}to step {self.config.steps}, "
+            f"{self.ranks.world} process{'es' if self.ranks.world > 1 else ''}, {torch.get_num_threads()} threads, "
+            f"{runtime.current().info.name}"
+        )
+
+
+def window_set(data: DataConfig) -> WindowSet:
+    """The windows that a configuration's data hold.
+
+    Raises:
+        ValueError: no prepared clip there, or none long enough.
+    """
+    clips = [clip for root in data.train for clip in find_prepared(root)]
+    return WindowSet(
+        clips, horizons=data.horizons, crop=data.crop, flip=data.flip, colour=data.colour, right=data.right,
+        frames=data.frames, scale=data.scale,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("default", UserWarning)
+    sys.exit(main())

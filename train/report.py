@@ -1,0 +1,134 @@
+"""What a run tells while it goes on: a bar on the terminal, log.jsonl, TensorBoard's scalars and images."""
+
+import json
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch.utils.tensorboard import SummaryWriter
+
+from train.config import Config
+from train.data import Batch
+from train.trainer import Update
+from vestcl import sheet
+from vestcl.io.images import write_pixels
+from vestcl.models.forecaster import RenderedView
+
+LOG: Final = "log.jsonl"
+
+#: Losses on the bar are means over so many updates.
+_SMOOTHED: Final = 50
+
+#: Columns of a sheet of a training image, px.
+_CELL: Final = 416
+
+
+class Reporter:
+    """Of the run ``config`` from ``step`` on; in processes other than the first it is silent."""
+
+    def __init__(self, config: Config, step: int, console: Console, speaks: bool) -> None:
+        self.console, self._speaks, self._config = console, speaks, config
+        self._recent: deque[Mapping[str, float]] = deque(maxlen=_SMOOTHED)
+        if speaks:
+            config.out.mkdir(parents=True, exist_ok=True)
+            _cut_log(config.out / LOG, step)
+            self._log = (config.out / LOG).open("a")
+            self._board = SummaryWriter(str(config.out / "tensorboard"), purge_step=step)
+
+    @contextmanager
+    def bar(self, step: int) -> Iterator[None]:
+        """A bar from ``step`` to the run's end."""
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        drawn = self._speaks and self.console.is_terminal
+        with Progress(*columns, TimeRemainingColumn(), console=self.console, disable=not drawn) as self._bar:
+            self._task = self._bar.add_task("", total=self._config.steps, completed=step)
+            try:
+                yield
+            finally:
+                self.close()
+
+    def updated(self, step: int, stage: str, rate: float, update: Update, waited: float, batch: Batch) -> None:
+        """Tell of the update that made ``step`` updates."""
+        if not self._speaks:
+            return
+        seconds = {"data": waited, **update.seconds}
+        self._recent.append({**update.terms, **{f"s_{name}": value for name, value in seconds.items()}})
+        self._bar.update(self._task, completed=step, description=self._described(stage))
+        run = self._config.run
+        if step % run.log_every == 0 or step == self._config.steps:
+            self._write(step, stage, rate, batch.horizon)
+        if run.image_every and step % run.image_every == 0 and update.view is not None:
+            picture = training_sheet(batch, update.view, f"step {step}, t+{batch.horizon}, {batch.clips[0]}")
+            write_pixels(self._config.out / "images" / f"step-{step:08d}.png", picture)
+            self._board.add_image("forecast", picture, step, dataformats="HWC")
+        if update.skipped:
+            self.say(f"step {step}: no number, skipped ({', '.join(batch.clips)})", "yellow")
+
+    def say(self, text: str, style: str = "") -> None:
+        """A line above the bar."""
+        if self._speaks:
+            self.console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
+
+    def close(self) -> None:
+        """Finish the files; may be called twice."""
+        if self._speaks:
+            self._log.close()
+            self._board.close()
+
+    def _means(self) -> dict[str, float]:
+        last = list(self._recent)[-self._config.run.log_every :]
+        return {name: float(np.mean([each[name] for each in last])) for name in last[-1]}
+
+    def _described(self, stage: str) -> str:
+        means = {name: float(np.mean([each[name] for each in self._recent])) for name in self._recent[-1]}
+        split = "+".join(f"{means[f's_{name}']:.2f}" for name in ("data", "networks", "splatting"))
+        return f"{stage}  loss {means['loss']:.4f}  l1 {means.get('l1', 0):.4f}  {split} s data+networks+splatting"
+
+    def _write(self, step: int, stage: str, rate: float, horizon: int) -> None:
+        means = self._means()
+        about: dict[str, Any] = {"step": step, "stage": stage, "learning_rate": rate, "horizon": horizon}
+        self._log.write(json.dumps(about | {name: _digits(value) for name, value in means.items()}) + "\n")
+        self._log.flush()
+        for name, value in (means | {"learning_rate": rate}).items():
+            kind = "seconds" if name.startswith("s_") else "training"
+            self._board.add_scalar(f"{kind}/{name.removeprefix('s_')}", value, step)
+        if not self.console.is_terminal:
+            self.say(f"step {step}/{self._config.steps}  {self._described(stage)}")
+
+
+def training_sheet(batch: Batch, view: RenderedView, title: str) -> sheet.Picture:
+    """The batch's first window: what was shown at t, what was forecast, the truth, and where they differ.
+
+    Returns:
+        [H, W, 3] uint8.
+    """
+    forecast = view.image[0].detach().float().clamp(0, 1).numpy()
+    truth, before = batch.target[0].numpy(), batch.frame_cur.image[0].numpy()
+    error = np.abs(forecast - truth).mean(0, keepdims=True)
+    cells = [
+        [sheet.Cell(sheet.rgb(before), "t"), sheet.Cell(sheet.rgb(truth), "truth")],
+        [sheet.Cell(sheet.rgb(forecast), "forecast"), sheet.Cell(sheet.heat(error), "error")],
+    ]
+    return sheet.sheet(cells, title=title, cell_width=_CELL)
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """The rows of a log.jsonl; a last line that a killed process left half written is left out."""
+    lines = path.read_text().split("\n")[:-1]
+    return [json.loads(line) for line in lines]
+
+
+def _cut_log(path: Path, step: int) -> None:
+    """Rows after ``step`` are of updates that a checkpoint never saw, and will be made again."""
+    if path.exists():
+        kept = [row for row in read_log(path) if row["step"] <= step]
+        path.write_text("".join(json.dumps(row) + "\n" for row in kept))
+
+
+def _digits(value: float) -> float | None:
+    return float(f"{value:.6g}") if np.isfinite(value) else None

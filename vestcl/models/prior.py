@@ -1,0 +1,82 @@
+"""What was measured of a motion before the networks look: where they start from, and what they correct."""
+
+from typing import NamedTuple
+
+import torch
+
+from vestcl import geometry
+from vestcl.models._clouds import as_image, as_points
+from vestcl.models._frames import FOREGROUND_BELOW
+from vestcl.models._layers import check
+from vestcl.models._render import RenderedView
+from vestcl.models.ego_motion import RigidMotion
+from vestcl.ops.unproject import unproject
+
+
+class MotionPrior(NamedTuple):
+    """The motion to the next frame as measurements extrapolate it (SPEC section 8)."""
+
+    next_from_prev: RigidMotion
+    """The camera's, B of them: from t - 1 to t + 1 ..."""
+    next_from_cur: RigidMotion
+    """... and from t to t + 1."""
+    velocity_prev: torch.Tensor
+    """[B, 3, H, W] m a frame interval, in the camera's axes at t - 1: how what each pixel shows moves in the world; 0
+    where it stands still."""
+    velocity_cur: torch.Tensor
+    """The same at t."""
+
+
+def check_prior(prior: MotionPrior, like: torch.Tensor) -> None:
+    """Refuse a prior of other frames than ``like`` [B, C, H, W].
+
+    Raises:
+        ValueError: a tensor of another shape.
+    """
+    batch, _, height, width = like.shape
+    check(
+        **{
+            f"prior.{name}.{part}": (getattr(getattr(prior, name), part), f"{batch} {size}")
+            for name in ("next_from_prev", "next_from_cur")
+            for part, size in (("quaternion", 4), ("translation", 3))
+        },
+        **{
+            f"prior.{name}": (getattr(prior, name), f"{batch} 3 {height} {width}")
+            for name in ("velocity_prev", "velocity_cur")
+        },
+    )
+
+
+def beside(prior: MotionPrior, to_next: tuple[RigidMotion, RigidMotion]) -> torch.Tensor:
+    """n R v [B, 6, H, W] m: what the velocities v add to the rigid flow over n = 2 and n = 1 intervals."""
+    moved = []
+    for velocity, rigid, intervals in zip((prior.velocity_prev, prior.velocity_cur), to_next, (2, 1), strict=True):
+        turn = geometry.quaternion_to_matrix(rigid.quaternion)
+        moved.append(intervals * torch.einsum("bij,bjhw->bihw", turn, velocity))
+    return torch.cat(moved, dim=1)
+
+
+def repeated(next_from_cur: RigidMotion, moved: torch.Tensor, seen: RenderedView, K: torch.Tensor) -> MotionPrior:
+    """The prior of the step after: the camera's motion G once more, and what moved beside it as it did.
+
+    What is seen at x came m over the interval, so beside the camera by s = x - G (x - m), if it is foreground. The
+    frame before has R^-1 of what its pixels moved beside the rigid flow.
+
+    Args:
+        next_from_cur: G of the step that is done.
+        moved: [B, 3, H, W] m, of its current frame's pixels beside the rigid flow, in the next camera's axes.
+        seen: its view from the source camera.
+        K: [B, 3, 3] px.
+
+    Returns:
+        The prior; no gradient.
+    """
+    height, width = seen.depth.shape[2:]
+    once = RigidMotion(*(part.detach() for part in next_from_cur))
+    rigid = geometry.compose_rigid(*once)
+    points = unproject(seen.depth.detach(), K)
+    before = geometry.transform_points(rigid, points - as_points(seen.motion_xyz))
+    velocity = as_image(points - before, height, width)
+    known = (seen.depth > 0) & (seen.background < FOREGROUND_BELOW)
+    velocity_prev = torch.einsum("bji,bjhw->bihw", rigid[:, :3, :3], moved.detach())
+    return MotionPrior(once.after(once), once, velocity_prev, torch.where(known, velocity, 0))

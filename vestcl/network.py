@@ -1,0 +1,119 @@
+"""Forecasts by a trained network, asked for and answered as those of `vestcl.geometric` are."""
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vestcl.data.sample import Clip
+from vestcl.forecast import Forecast, Rendered, View
+from vestcl.geometric.perception import Perception
+from vestcl.models.forecaster import Forecaster, Mode, RenderedView
+from vestcl.network_input import NetworkInput, last_motions, network_input
+from vestcl.prepared import prepare_frame
+
+Progress = Callable[[str, float], None]
+
+#: Stages of a forecast that `Perception` tells of: results for two frames, and the picture before them.
+_STAGES = 13
+
+
+def forecast_clip(
+    clip: Clip,
+    index: int,
+    steps: int,
+    views: Sequence[View],
+    model: Forecaster,
+    *,
+    mode: Mode = "compose",
+    progress: Progress | None = None,
+) -> Forecast:
+    """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` alone.
+
+    Args:
+        clip: at its own size; its later frames and poses are not looked at.
+        index: the current frame t, 1 or more.
+        steps: frames to forecast, 1 or more.
+        views: cameras to show each from.
+        model: a trained network, see `Forecaster.load`.
+        mode: how steps after the first are made, see `Forecaster.forecast`.
+        progress: called with the stage and the share of the work that is done.
+
+    Returns:
+        The forecast, of the clip's height and width.
+
+    Raises:
+        ValueError: no such frame or none before it, no steps, no views, or a clip that depth can't be had for.
+    """
+    done = [0]
+
+    def tell(stage: str) -> None:
+        if progress:
+            progress(stage, min(done[0] / _STAGES, 1.0))
+        done[0] += 1
+
+    return forecast_frames(Perception(clip, tell), model, index, steps, views, mode=mode, tell=tell)
+
+
+def forecast_frames(
+    perception: Perception,
+    model: Forecaster,
+    index: int,
+    steps: int,
+    views: Sequence[View],
+    *,
+    mode: Mode = "compose",
+    tell: Callable[[str], None] = lambda stage: None,
+) -> Forecast:
+    """`forecast_clip` on a `Perception` that may have seen earlier frames already, and keeps what it sees.
+
+    Args:
+        perception: of the clip.
+        model: the network.
+        index: the current frame t.
+        steps: frames to forecast.
+        views: cameras to show each from.
+        mode: see `Forecaster.forecast`.
+        tell: called with the stage before the networks run.
+
+    Raises:
+        ValueError: as `forecast_clip`.
+    """
+    clip = perception.clip
+    if not 1 <= index < len(clip):
+        raise ValueError(f"`index` must be 1 ... {len(clip) - 1}, a frame of {clip.name} with one before, got {index}")
+    if steps < 1 or not views:
+        raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
+    prev, cur = prepare_frame(perception, index - 1), prepare_frame(perception, index)
+    given = network_input(prev, cur, last_motions(prev, cur))
+    tell("network")
+    start = time.perf_counter()
+    with torch.inference_mode():
+        done = model.forecast(
+            given.frame_prev, given.frame_cur, given.K, steps, cameras(views, given), mode,
+            prior=given.prior if model.config.start == "prior" else None,
+        )  # fmt: skip
+    names = [view.name for view in views]
+    frames = [dict(zip(names, map(_rendered, step.views), strict=True)) for step in done]
+    motions = [step.future_from_cur[0].double().numpy() for step in done]
+    seconds = perception.seconds | {"network": time.perf_counter() - start}
+    return Forecast(model.config.name, motions, frames, seconds)
+
+
+def cameras(views: Sequence[View], given: NetworkInput) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """``views`` as `Forecaster.forecast` takes them: (tgt_from_next [1, 4, 4], K [1, 3, 3])."""
+    return [(_tensor(view.tgt_from_next), given.K if view.K is None else _tensor(view.K)) for view in views]
+
+
+def _tensor(matrix: NDArray[np.float64]) -> torch.Tensor:
+    return torch.from_numpy(np.array(matrix, np.float32))[None]
+
+
+def _rendered(view: RenderedView) -> Rendered:
+    image, depth, coverage, motion_xyz = (
+        np.ascontiguousarray(plane[0].float().numpy())
+        for plane in (view.image.clamp(0, 1), view.depth, view.coverage, view.motion_xyz)
+    )
+    return Rendered(image, depth, coverage, motion_xyz)

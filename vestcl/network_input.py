@@ -1,0 +1,101 @@
+"""What is known of two frames, as the networks take it: layers, the camera, and the motion as measurements extrapolate
+it."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vestcl import geometry
+from vestcl.models.ego_motion import RigidMotion
+from vestcl.models.prior import MotionPrior
+from vestcl.prepared import Prepared
+from vestcl.scene import _check
+from vestcl.scene.ego_motion import constant_velocity
+from vestcl.scene.layers import LayerBatch, batch
+
+
+class NetworkInput(NamedTuple):
+    """Two frames of one clip, B = 1, float32."""
+
+    frame_prev: LayerBatch
+    """At t - 1."""
+    frame_cur: LayerBatch
+    """At t."""
+    K: torch.Tensor
+    """[1, 3, 3] px, of both."""
+    prior: MotionPrior
+    """Where the networks start from."""
+
+
+def network_input(prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.float64]]) -> NetworkInput:
+    """Two prepared frames with their motion prior: constant velocity, of the camera and of all that moves beside it.
+
+    next_from_cur = constant_velocity(motions) and next_from_prev = next_from_cur cur_from_prev, with the last motion
+    as cur_from_prev. What moves, moves by its own velocity v in the axes of its frame: the networks take it to
+    R (x + n v) + t after n intervals. The recording car's own bonnet does not move in the picture, so there
+    x = R (x + n v) + t, which gives v = (R^-1 (x - t) - x) / n: n = 2 intervals from t - 1, and 1 from t.
+
+    Args:
+        prev: the frame at t - 1.
+        cur: the frame at t, of the same size and camera.
+        motions: ``cur_from_prev`` [4, 4] m of the last consecutive frames, oldest first; the last one is from ``prev``
+            to ``cur``. One or two are usual, see `last_motions`.
+
+    Returns:
+        The input with B = 1; tensors of their own memory.
+
+    Raises:
+        ValueError: frames of different sizes or cameras, no motion, or a matrix that is not finite.
+
+    Source: SPEC section 8; `vestcl.geometric.forecast_frames` extrapolates alike.
+    """
+    if prev.layers.image.shape != cur.layers.image.shape:
+        sizes = [f"{frame.layers.image.shape[1]}x{frame.layers.image.shape[2]}" for frame in (prev, cur)]
+        raise ValueError(f"`prev` and `cur` must be of one size, got {sizes[0]} and {sizes[1]}")
+    if not np.allclose(prev.K, cur.K):
+        raise ValueError(f"`prev` and `cur` must have one K, got {prev.K.tolist()} and {cur.K.tolist()}")
+    motions = [_check.matrix("motions", motion, 4) for motion in motions]
+    next_from_cur = constant_velocity(motions)
+    next_from_prev = next_from_cur @ motions[-1]
+    prior = MotionPrior(
+        as_motion(next_from_prev),
+        as_motion(next_from_cur),
+        torch.from_numpy(_velocity(prev, next_from_prev, 2)[None]),
+        torch.from_numpy(_velocity(cur, next_from_cur, 1)[None]),
+    )
+    return NetworkInput(batch([prev.layers]), batch([cur.layers]), torch.from_numpy(cur.K[None]).float(), prior)
+
+
+def last_motions(*frames: Prepared) -> list[NDArray[np.float64]]:
+    """``cur_from_prev`` [4, 4] m of each frame that has a ``prev_from_cur``: all but a clip's first, oldest first.
+
+    Args:
+        *frames: consecutive ones, oldest first; t - 1 and t give the two motions that `vestcl.geometric` takes.
+
+    Returns:
+        As many motions as frames, or one fewer.
+    """
+    known = [frame.prev_from_cur for frame in frames if frame.prev_from_cur is not None]
+    return [np.asarray(np.linalg.inv(prev_from_cur), np.float64) for prev_from_cur in known]
+
+
+def as_motion(dst_from_src: NDArray[np.float64]) -> RigidMotion:
+    """A rigid [4, 4] m as networks have it: unit quaternion [1, 4] with w >= 0 and translation [1, 3] m, float32."""
+    rigid = torch.from_numpy(dst_from_src[None])
+    return RigidMotion(geometry.matrix_to_quaternion(rigid[:, :3, :3]).float(), rigid[:, :3, 3].float())
+
+
+def _velocity(frame: Prepared, next_from_src: NDArray[np.float64], intervals: int) -> NDArray[np.float32]:
+    """[3, H, W] m a frame interval: the frame's, but the recording car stays where it is in the picture."""
+    if not frame.own.any():
+        return np.array(frame.velocity, np.float32)
+    y, x = np.nonzero(frame.own[0])
+    rays = np.linalg.inv(frame.K) @ np.stack([x + 0.5, y + 0.5, np.ones(len(x))])
+    points = rays * frame.layers.depth[0, y, x]
+    src_from_next = np.linalg.inv(next_from_src)
+    velocity = np.array(frame.velocity, np.float32)
+    velocity[:, y, x] = (src_from_next[:3, :3] @ points + src_from_next[:3, 3:] - points) / intervals
+    return velocity
