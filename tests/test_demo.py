@@ -1,4 +1,4 @@
-"""The demo forecasts a street from its stereo pairs, and better than its baselines."""
+"""The demo forecasts a street from its stereo pairs, and better than its baselines; with a network, or without."""
 
 import json
 from pathlib import Path
@@ -7,14 +7,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vestcl import demo
+from vestcl import demo, pretrained
 from vestcl.data import Street
+from vestcl.models import configuration
+from vestcl.models.forecaster import Forecaster
 from vestcl.views import parse_view
 
 
-def test_does_the_whole_job(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("model", ["geometric", "vest-s"])
+def test_does_the_whole_job(model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if model not in ("geometric", *pretrained.shipped()):
+        pytest.skip(f"no trained {model} has been put into vestcl/weights yet")
     out = tmp_path / "new" / "folder"
-    demo.run(out, height=96, width=312, seed=4, steps=3)
+    demo.run(out, height=96, width=312, seed=4, model=model, steps=3)
     said = capsys.readouterr().out.replace("\n", "")
     about = json.loads((out / "forecast.json").read_text(encoding="utf-8"))
     for view in ("source", "right", "beside"):
@@ -28,6 +33,33 @@ def test_does_the_whole_job(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         of = {method: np.mean([step["psnr"] for step in steps]) for method, steps in scores[view].items()}
         assert of["forecast"] > of["repeat last"] + 2
         assert of["forecast"] > of["optical flow"]
+        assert (set(of) - {"forecast", "repeat last", "optical flow"}) == ({"geometric"} - {model})
+
+
+def test_the_shipped_network_is_the_usual_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+    demo.run(tmp_path / "without", height=48, width=160, seed=4, steps=1)
+    assert "forecast without any trained weights" in " ".join(capsys.readouterr().out.split())
+    Forecaster(configuration("vest-s")).save(tmp_path / "vest-s.safetensors")
+    demo.run(tmp_path / "with", height=48, width=160, seed=4, steps=1)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "forecast by the network vest-s" in said and "geometric, to compare" in said
+    without, about = (json.loads((tmp_path / name / "forecast.json").read_text()) for name in ("without", "with"))
+    assert (without["method"], about["method"]) == ("geometric", "vest-s")
+    assert about["settings"]["model_file"] == "vest-s.safetensors"
+    for view, scores in about["scores"].items():
+        assert list(scores) == ["forecast", "geometric", "repeat last", "optical flow"]
+        assert scores["geometric"] == without["scores"][view]["forecast"]
+        assert scores["geometric"] != scores["forecast"]
+
+
+def test_an_unknown_model(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="vest-xl: is no model"):
+        demo.run(tmp_path / "out", height=48, width=160, seed=4, model="vest-xl")
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_forecast_gets_no_truth() -> None:

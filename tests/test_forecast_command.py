@@ -1,9 +1,6 @@
 """`vestcl forecast` from the command line to its files, on small clips and with a forecaster that repeats a frame."""
 
-import json
 import types
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,41 +8,20 @@ import numpy as np
 import pytest
 import torch
 from data_files import write_pictures, write_text
+from forecast_clips import FRAMES, HEIGHT, WIDTH, Repeater, write_clip
 from stand_ins import put_module
 
 from vestcl import cli, runtime
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
-from vestcl.forecast import Forecast, Rendered, View
 from vestcl.forecast_files import read_forecast
 from vestcl.io.video import Video
 from vestcl.models.trunks import Trunk
 
-HEIGHT, WIDTH, FRAMES = 24, 40, 6
-
-
-@dataclass
-class Repeater:
-    """In place of the forecaster: every view is frame t, and the calls are kept."""
-
-    calls: list[tuple[Clip, int, int, list[View]]] = field(default_factory=list)
-    devices: list[str] = field(default_factory=list)
-
-    def __call__(
-        self, clip: Clip, index: int, steps: int, views: Sequence[View], *, progress: Callable[[str, float], None]
-    ) -> Forecast:
-        self.calls.append((clip, index, steps, list(views)))
-        self.devices.append(runtime.current().info.index)
-        image = clip[index].read_image()
-        plane = np.ones_like(image[:1])
-        progress("repeat", 0.5)
-        rendered = Rendered(image, 10 * plane, plane, 0 * image)
-        return Forecast("repeater", [np.eye(4)] * steps, [{v.name: rendered for v in views}] * steps, {"repeat": 0.25})
-
 
 @pytest.fixture
 def repeater(monkeypatch: pytest.MonkeyPatch) -> Repeater:
-    repeater = Repeater()
+    repeater = Repeater("repeater")
     put_module(monkeypatch, "vestcl.geometric", forecast_clip=repeater)
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.delenv("VESTCL_DEVICE", raising=False)
@@ -54,13 +30,7 @@ def repeater(monkeypatch: pytest.MonkeyPatch) -> Repeater:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A stereo clip of noise."""
-    folder = tmp_path / "clip"
-    for side in ("image", "right"):
-        write_pictures(folder / side, [f"{i:04}.png" for i in range(FRAMES)], HEIGHT, WIDTH)
-    camera = {"fx": 40, "fy": 40, "cx": 19.5, "cy": 11.5, "fps": 25, "baseline": 0.5}
-    write_text(folder / "camera.json", json.dumps(camera))
-    return folder
+    return write_clip(tmp_path / "clip")
 
 
 def test_everything_at_once(
@@ -249,6 +219,8 @@ def test_squeeze_weights(folder: Path, tmp_path: Path, repeater: Repeater) -> No
         ("--compare --steps 1 --view 0,0,1", "`views` must have one with a truth to compare with"),
         ("--view above", "`view` must be"),
         ("--view right --view right", "got right twice"),
+        ("--mode feedback", "`mode` is how a network goes on after its first step; it needs `model`"),
+        ("--model vest-xl", "vest-xl: is no model: no file, no checkpoint's folder, and none of vest-s"),
         ("--squeeze x.pth", "`squeeze` is a distance to the truth; it needs `compare`"),
         ("--squeeze x.pth --compare --steps 1", "no squeezenet1_0 weights at x.pth"),
         ("--fov 90", "camera.json: tells the camera; leave out `fov`"),

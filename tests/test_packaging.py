@@ -1,4 +1,4 @@
-"""Kernels are found and build from a wheel, an editable install and a bare checkout, each in a path with a space."""
+"""Kernels build and weights are found: in a wheel, an editable install, a bare checkout, in paths with a space."""
 
 import os
 import shutil
@@ -14,11 +14,13 @@ import pytest
 from vestcl import __version__
 
 ROOT = Path(__file__).resolve().parents[1]
+WEIGHTS = "vestcl/weights/vest-s.safetensors"
 BUILD_A_KERNEL = """
 import numpy as np
-from vestcl import runtime
+from vestcl import pretrained, runtime
 runtime.current().kernel("unproject.cl", "unproject", runtime.defines_for(np.dtype(np.float32)))
 print(runtime.kernel_folder())
+print(pretrained.shipped()["vest-s"])
 """
 
 
@@ -29,6 +31,8 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     no_caches = shutil.ignore_patterns("__pycache__")
     for name in ("vestcl", "kernels"):
         shutil.copytree(ROOT / name, folder / name, ignore=no_caches)
+    (folder / WEIGHTS).parent.mkdir(exist_ok=True)
+    (folder / WEIGHTS).touch()  # which file it is does not matter here
     for name in ("tests", "train"):  # must stay out of the wheel
         (folder / name).mkdir()
         (folder / name / "__init__.py").touch()
@@ -50,12 +54,13 @@ def pip(python: str, command: str, *arguments: str) -> None:
     subprocess.run([sys.executable, "-m", "pip", "--python", python, command, *options, *arguments], check=True)
 
 
-def kernel_folder(python: str, path: Path | None, away: Path) -> Path:
-    """Where a child that is started in folder ``away`` finds the kernels, once it has built one."""
+def found(python: str, path: Path | None, away: Path) -> tuple[Path, Path]:
+    """Where a child that is started in folder ``away`` finds the kernels, once it has built one, and the weights."""
     environment = {**os.environ, "PYTHONPATH": str(path or "")}
     command = [python, "-c", BUILD_A_KERNEL]
     done = subprocess.run(command, cwd=away, env=environment, check=True, stdout=subprocess.PIPE, text=True)
-    return Path(done.stdout.strip())
+    kernels, weights = done.stdout.splitlines()
+    return Path(kernels), Path(weights)
 
 
 def files(folder: Path, *patterns: str) -> set[str]:
@@ -70,7 +75,9 @@ def test_the_wheel_holds_every_kernel_and_module_and_nothing_else(wheel: Path, c
     kernels = {f"vestcl/kernels/{name}" for name in files(checkout / "kernels", "*.cl", "*.h")}
     modules = {f"vestcl/{name}" for name in files(checkout / "vestcl", "*.py")}
     assert kernels
-    assert shipped == kernels | modules
+    weights = {f"vestcl/{name}" for name in files(checkout / "vestcl", "*.safetensors")}
+    assert WEIGHTS in weights
+    assert shipped == kernels | modules | weights
 
 
 def test_both_versions_are_one(wheel: Path) -> None:
@@ -81,11 +88,11 @@ def test_kernels_build_from_a_wheel(wheel: Path, tmp_path: Path) -> None:
     site = tmp_path / "site packages"
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(site)
-    assert kernel_folder(sys.executable, site, tmp_path) == site / "vestcl" / "kernels"
+    assert found(sys.executable, site, tmp_path) == (site / "vestcl" / "kernels", site / WEIGHTS)
 
 
 def test_kernels_build_from_a_bare_checkout(checkout: Path, tmp_path: Path) -> None:
-    assert kernel_folder(sys.executable, checkout, tmp_path) == checkout / "kernels"
+    assert found(sys.executable, checkout, tmp_path) == (checkout / "kernels", checkout / WEIGHTS)
 
 
 def test_kernels_build_from_an_editable_install(checkout: Path, tmp_path: Path) -> None:
@@ -96,4 +103,4 @@ def test_kernels_build_from_an_editable_install(checkout: Path, tmp_path: Path) 
     (site / "outer.pth").write_text(sysconfig.get_path("purelib"))  # vestcl's dependencies, without its own .pth
     python = str(environment / "bin" / "python")
     pip(python, "install", "--editable", str(checkout))
-    assert kernel_folder(python, None, tmp_path) == checkout / "kernels"
+    assert found(python, None, tmp_path) == (checkout / "kernels", checkout / WEIGHTS)

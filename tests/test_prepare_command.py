@@ -1,5 +1,6 @@
 """`vestcl prepare` from its command line: inputs, shards, streets and errors."""
 
+import dataclasses
 import errno
 import resource
 from pathlib import Path
@@ -79,6 +80,28 @@ def test_random_driving() -> None:
     assert speeds[1] == speeds[2] != speeds[0]
     assert frame_keys(drawn) == frame_keys(again)
     assert not set(frame_keys(drawn)) & set(frame_keys(usual))
+
+
+def test_streets_without_their_depth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    true, stereo = (prepare_command.open_input("street:5", options(street_depth=kind)) for kind in ("true", "stereo"))
+    assert all(sample.depth is not None for sample in true)
+    for known, sample in zip(true, stereo, strict=True):
+        assert sample.depth is None
+        assert sample.right is not None and known.right is not None
+        assert sample.right.image == known.right.image and sample.labels == known.labels
+        assert sample.world_from_cam is not None and known.world_from_cam is not None
+        assert np.array_equal(sample.world_from_cam, known.world_from_cam)
+    assert not set(frame_keys(true)) & set(frame_keys(stereo))
+    settings = options("street:5", out=tmp_path, frames=2)
+    assert run(settings, capsys) == (2, 0)
+    matched = dataclasses.replace(settings, street_depth="stereo")
+    assert run(matched, capsys) == (2, 0)
+    assert run(matched, capsys) == (0, 2)
+    (clip,) = find_prepared(tmp_path)
+    truth = true[1].read_depth()
+    near = truth < 20
+    ratio = clip.frame(1).layers.depth[near] / truth[near]
+    assert 0.8 < np.median(ratio) < 1.2 and np.abs(ratio - 1).max() > 0.01  # measured, not copied
 
 
 def test_errors(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""The command line: `vestcl forecast`, `devices`, `doctor`, `demo`, `bench`. What imports torch is imported late."""
+"""The command line: `vestcl forecast`, `prepare`, `devices`, `doctor`, `demo`, `bench`. Torch is imported late."""
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -93,6 +93,8 @@ class Demo:
     """Pixels."""
     seed: int = 0
     """Which street."""
+    model: str | None = None
+    """vest-s, a .safetensors file, a checkpoint's folder, or geometric. Without it: vest-s, where it is installed."""
     device: str | None = None
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
 
@@ -101,7 +103,7 @@ class Demo:
         from vestcl import demo
 
         with runtime.use(self.device):
-            demo.run(self.out, self.height, self.width, self.seed)
+            demo.run(self.out, self.height, self.width, self.seed, self.model)
         return 0
 
 
@@ -119,6 +121,10 @@ class Forecast:
     """Folder for the files; those of an earlier forecast are replaced one by one."""
     steps: int = 5
     """Frames to forecast."""
+    model: str | None = None
+    """Forecast by a network: vest-s, a .safetensors file, a training checkpoint's folder. Without it: by geometry."""
+    mode: Literal["compose", "feedback"] | None = None
+    """With --model: repeat the first step's motion (compose, which is usual), or see each forecast frame (feedback)."""
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Where to look from: source, right, left, or x,y,z[,yaw=][,pitch=][,roll=][,fov=][,name=], as in
     "0.5,0,0,yaw=-5": metres to the right of, below and ahead of the source camera, and degrees to the right, up and
@@ -127,7 +133,7 @@ class Forecast:
     """The current frame t, counted from 0; it and the ones before it are seen. Without it: the last one, or with
     --compare the last that has STEPS true frames after it."""
     compare: bool = False
-    """Score the forecast, and two baselines, against the frames that the clip goes on with."""
+    """Score forecast and baselines (with --model geometry, too) against the frames that the clip goes on with."""
     squeeze: Path | None = None
     """With --compare: SqueezeNet 1.0 weights for a distance in its features."""
     height: int | None = None
@@ -172,6 +178,65 @@ class Forecast:
 
 
 @dataclass(frozen=True)
+class Prepare:
+    """Compute depth, masks, inpainting and motion of clips' frames once, for training, evaluation and forecasts.
+
+    Frames that are there, of the same input, are kept; it may be stopped at any moment, and run twice at once.
+    """
+
+    inputs: tyro.conf.Positional[tuple[str, ...]]
+    """Clips, as `vestcl forecast` opens them, or procedural streets: street:SEED, street:FIRST-LAST."""
+    out: Path | None = None
+    """Folder of the cache; a folder in it for each clip. Without it: .vestcl in each input."""
+    height: int = 256
+    """Pixels."""
+    width: int = 832
+    """Pixels."""
+    frames: int = 12
+    """Frames of each street."""
+    samples: int = 2
+    """Streets' colour is the mean over samples x samples rays a pixel."""
+    drive: Literal["usual", "random"] = "usual"
+    """How cameras drive down streets: as the street has it, or drawn at random in the ranges of real cars, from a
+    random time on."""
+    street_depth: Literal["true", "stereo"] = "true"
+    """Where streets' depth comes from: the street itself, or as on the road the matching of its stereo pairs."""
+    shard: str | None = None
+    """I/N, I from 0: every N-th clip from the I-th on. Without it what torchrun tells, if it started this."""
+    workers: int = 1
+    """Processes."""
+    fov: float | None = None
+    """Horizontal field of view in degrees, of a video or a folder without camera.json."""
+    depth: Path | None = None
+    """Folder of depth files (.png, .exr, .npy) with the frames' names."""
+    depth_scale: float | None = None
+    """Their units per metre; PNG needs it (KITTI 256)."""
+    labels: Path | None = None
+    """Folder of label PNGs with the frames' names."""
+    label_ids: Literal["trainIds", "labelIds", "virtual_kitti"] = "trainIds"
+    """What they hold."""
+    depth_model: str | None = None
+    """Estimate depth by this checkpoint (a folder, or a name on huggingface.co)."""
+    mask_model: str | None = None
+    """Estimate classes by this checkpoint (a folder, or a name on huggingface.co)."""
+    rig: str | None = None
+    """KITTI: colour or grey cameras."""
+    sequence: str | None = None
+    """KITTI odometry: which one, if there are several."""
+    snippet: str | None = None
+    """Cityscapes: name of the annotated frame, if there are several."""
+    variant: str | None = None
+    """Virtual KITTI: clone, fog ..., if there are several."""
+
+    def run(self) -> int:
+        """Fill the cache."""
+        from vestcl import prepare_command
+
+        prepare_command.run(self)
+        return 0
+
+
+@dataclass(frozen=True)
 class Bench:
     """Time a part of vestcl: `vestcl bench splat`, `network`, `inpaint` or `forecast`."""
 
@@ -198,6 +263,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _command(arguments: Sequence[str]) -> int:
     commands: dict[str, Callable[..., Any]] = {
         "forecast": Forecast,
+        "prepare": Prepare,
         "devices": Devices,
         "doctor": Doctor,
         "demo": Demo,

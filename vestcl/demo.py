@@ -1,13 +1,15 @@
 """`vestcl demo`: the whole job on a procedural street, whose future can be seen from any camera.
 
 What a car with two cameras would have is all that the forecast gets: the stereo pairs up to now, their calibration, and
-classes of the pixels, as a segmentation network tells them.
+classes of the pixels, as a segmentation network tells them. A network's forecast is held against the geometric one,
+which is made of the same depth and motion.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -16,12 +18,15 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from vestcl import baselines, forecast_files, geometric, metrics, sheet
+from vestcl import baselines, forecast_files, geometric, metrics, network, pretrained, sheet
+from vestcl.compare import FORECAST
 from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, View
 from vestcl.geometric import Perception
+from vestcl.geometric.forecast import METHOD as GEOMETRIC
 from vestcl.io.images import write_pixels
+from vestcl.models.forecaster import Forecaster
 from vestcl.sheet import Cell
 from vestcl.views import parse_views
 
@@ -40,10 +45,13 @@ VIEWS: Final = ("source", "right", "0.6,-0.3,0,yaw=-4,name=beside")
 #: Steps that the sheet shows.
 SHOWN: Final = (1, 3, 5)
 
+#: The trained network that forecasts where no other is named and its weights are here.
+NETWORK: Final = "vest-s"
+
 Image = NDArray[np.float32]
 
 
-def run(out: Path, height: int, width: int, seed: int, steps: int = 5) -> None:
+def run(out: Path, height: int, width: int, seed: int, model: str | None = None, steps: int = 5) -> None:
     """Forecast one street from three cameras, compare with what then happens there, and write it all.
 
     Args:
@@ -51,25 +59,35 @@ def run(out: Path, height: int, width: int, seed: int, steps: int = 5) -> None:
         height: rows of the pictures.
         width: columns of the pictures.
         seed: of the street.
+        model: NETWORK or any other that `vestcl.pretrained.load_model` knows, or GEOMETRIC; None is NETWORK where this
+            installation has it, else GEOMETRIC.
         steps: frames to forecast.
+
+    Raises:
+        ValueError: no such model.
     """
+    name = model or (NETWORK if NETWORK in pretrained.shipped() else GEOMETRIC)
+    forecaster = None if name == GEOMETRIC else pretrained.load_model(name)
     console, street = Console(), Street.generate(seed)
     clip = street.clip(CONTEXT + steps, height, width, start=START, fps=FPS, samples=SAMPLES)
     seen, index = stereo_only(clip), CONTEXT - 1
     views = parse_views(VIEWS, clip[index])
     with console.status("forecasting") as status:
         perception = Perception(seen, lambda stage: status.update(f"forecasting: {stage}"))
-        forecast = geometric.forecast_frames(perception, index, steps, views)
+        forecasts = _forecasts(perception, index, steps, views, forecaster)
+        forecast = forecasts[FORECAST]
         status.update("rendering the truth")
         truth = {view.name: [true_image(street, clip, index + k, view) for k in range(1, steps + 1)] for view in views}
         status.update("writing")
-        scores = {view.name: _scores(forecast, truth[view.name], clip, index, view) for view in views}
+        scores = {view.name: _scores(forecasts, truth[view.name], clip, index, view) for view in views}
         sheets = {view.name: sheet.forecast_sheet([frame[view.name] for frame in forecast.frames]) for view in views}
-        about = forecast_files.Details(f"street:{seed}", {"height": height, "width": width}, scores, sheets)
+        settings: dict[str, Any] = {"height": height, "width": width, "model": name}
+        settings |= {} if forecaster is None else pretrained.about_model(name)
+        about = forecast_files.Details(f"street:{seed}", settings, scores, sheets)
         forecast_files.write_forecast(out, forecast, seen, index, views, about)
         write_pixels(out / "sheet.png", _sheet(perception, index, forecast, truth))
-    console.print(_score_table(scores))
-    console.print(_time_table(forecast))
+    console.print(_score_table(scores, forecast))
+    console.print(_time_table(forecasts))
     for path in (*(out / view.name for view in views), out / forecast_files.JSON, out / "sheet.png"):
         console.print(str(path), soft_wrap=True, highlight=False)
 
@@ -90,13 +108,23 @@ def true_image(street: Street, clip: Clip, index: int, view: View) -> Image:
     return frame.colour[0]
 
 
+def _forecasts(
+    perception: Perception, index: int, steps: int, views: Sequence[View], forecaster: Forecaster | None
+) -> dict[str, Forecast]:
+    """The forecast, and beside a network's the geometric one, both from what is perceived once."""
+    by_geometry = functools.partial(geometric.forecast_frames, perception, index, steps, views)
+    if forecaster is None:
+        return {FORECAST: by_geometry()}
+    return {FORECAST: network.forecast_frames(perception, forecaster, index, steps, views), GEOMETRIC: by_geometry()}
+
+
 def _scores(
-    forecast: Forecast, truth: list[Image], clip: Clip, index: int, view: View
+    forecasts: dict[str, Forecast], truth: list[Image], clip: Clip, index: int, view: View
 ) -> dict[str, list[dict[str, float]]]:
     """method -> step -> metric. What the baselines know of another view is the source's."""
     pair = [torch.from_numpy(clip[at].read_image())[None] for at in (index - 1, index)]
     images: dict[str, Sequence[Image]] = {
-        "forecast": [frame[view.name].image for frame in forecast.frames],
+        **{name: [frame[view.name].image for frame in forecast.frames] for name, forecast in forecasts.items()},
         "repeat last": list(baselines.repeat_last(pair[0], pair[1], len(truth))[0].numpy()),
         "optical flow": list(baselines.flow_extrapolation(pair[0], pair[1], len(truth))[0].numpy()),
     }
@@ -127,16 +155,20 @@ def _sheet(perception: Perception, index: int, forecast: Forecast, truth: dict[s
                 [Cell(sheet.rgb(shown), label), Cell(sheet.rgb(wanted), "truth"), Cell(sheet.heat(error), "error")]
             )
     scale = ("error: 0", f"{sheet.WORST_ERROR} of the range and more")
-    return sheet.sheet(
-        rows, title="a street forecast from stereo pairs and class masks, without any trained weights", bar=scale
-    )
+    title = f"a street forecast from stereo pairs and class masks {_how(forecast)}"
+    return sheet.sheet(rows, title=title, bar=scale)
 
 
-def _score_table(scores: dict[str, dict[str, list[dict[str, float]]]]) -> Table:
-    steps = len(next(iter(scores.values()))["forecast"])
+def _how(forecast: Forecast) -> str:
+    return "without any trained weights" if forecast.method == GEOMETRIC else f"by the network {forecast.method}"
+
+
+def _score_table(scores: dict[str, dict[str, list[dict[str, float]]]], forecast: Forecast) -> Table:
+    steps = len(forecast.frames)
     shown = [step for step in SHOWN if step <= steps]
     headings = [f"t+{step}" for step in shown]
-    table = Table("PSNR dB / SSIM", *headings, box=box.SIMPLE)
+    title = f"forecast {_how(forecast)}"
+    table = Table("PSNR dB / SSIM", *headings, box=box.SIMPLE, title=title, title_justify="left")
     for view, methods in scores.items():
         for method, by_step in methods.items():
             cells = (f"{by_step[step - 1]['psnr']:.1f} / {by_step[step - 1]['ssim']:.3f}" for step in shown)
@@ -145,8 +177,11 @@ def _score_table(scores: dict[str, dict[str, list[dict[str, float]]]]) -> Table:
     return table
 
 
-def _time_table(forecast: Forecast) -> Table:
-    table = Table("stage", "ms", box=box.SIMPLE)
-    for name, seconds in forecast.seconds.items():
+def _time_table(forecasts: dict[str, Forecast]) -> Table:
+    """The forecast's stages, and what the geometric one beside a network's took in addition."""
+    table, stages = Table("stage", "ms", box=box.SIMPLE), dict(forecasts[FORECAST].seconds)
+    if GEOMETRIC in forecasts:
+        stages |= {"geometric, to compare": forecasts[GEOMETRIC].seconds["render"]}
+    for name, seconds in stages.items():
         table.add_row(name, f"{1000 * seconds:.0f}")
     return table

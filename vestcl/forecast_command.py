@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from rich import box
 from rich.console import Console
@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from vestcl import compare, forecast_files, runtime, sheet
+from vestcl import compare, forecast_files, pretrained, runtime, sheet
 from vestcl.compare import Comparison
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
@@ -26,6 +26,7 @@ from vestcl.views import parse_views
 
 if TYPE_CHECKING:
     from vestcl import cli
+    from vestcl.models.forecaster import Forecaster
 
 #: An input that is no file: the procedural street of this seed.
 STREET: Final = re.compile(r"street:(\d+)")
@@ -33,6 +34,9 @@ STREET: Final = re.compile(r"street:(\d+)")
 #: Frames of a street up to the current one where ``frame`` is not told, and its size in pixels: SPEC section 10.
 STREET_CONTEXT: Final = 4
 STREET_SIZE: Final = (256, 832)
+
+#: How a network goes on after its first step: this way its forecast takes least time.
+USUAL_MODE: Final[Literal["compose", "feedback"]] = "compose"
 
 #: Steps in a table of scores, so that it fits 80 letters; forecast.json has all.
 STEPS_SHOWN: Final = 5
@@ -81,15 +85,21 @@ def run(options: "cli.Forecast") -> None:
     with runtime.use(options.device), bar:
         stages = _Stages(bar)
         with stages.stage("open the clip"):
+            model = None if options.model is None else pretrained.load_model(options.model)
             clip = open_clip(options)
             index = current_frame(clip, options)
             views = parse_views(options.view or ("source",), clip[index])
             trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
-        forecast = _forecast(clip, index, options.steps, views, stages)
+        forecast = _forecast(clip, index, options, views, stages, model)
+        stages.seconds |= forecast.seconds
         comparisons = []
         if options.compare:
             with stages.stage("compare") as report:
                 comparisons = compare.compare(forecast, clip, index, views, trunk, report)
+                if model is not None:
+                    rival = _forecast(clip, index, options, views, stages)
+                    rivals = compare.compare(rival, clip, index, views, trunk)
+                    comparisons = [_beside(*pair, rival.method) for pair in zip(comparisons, rivals, strict=True)]
         with stages.stage(forecast_files.WRITING) as report:
             details = _details(options, clip, index, forecast, comparisons)
             told = dataclasses.replace(forecast, seconds=dict(stages.seconds))
@@ -150,6 +160,8 @@ def _check(options: "cli.Forecast") -> None:
         raise ValueError(f"`out` must be a folder, got the file {options.out}")
     if options.squeeze is not None and not options.compare:
         raise ValueError("`squeeze` is a distance to the truth; it needs `compare`")
+    if options.mode is not None and options.model is None:
+        raise ValueError("`mode` is how a network goes on after its first step; it needs `model`")
 
 
 def _street(seed: int, options: "cli.Forecast") -> Clip:
@@ -187,20 +199,39 @@ def _with_estimates(clip: Clip, options: "cli.Forecast") -> Clip:
     return estimators.with_estimates(clip, depth=depth, segmentation=classes)
 
 
-def _forecast(clip: Clip, index: int, steps: int, views: list[View], stages: _Stages) -> Forecast:
-    from vestcl import geometric
-
+def _forecast(
+    clip: Clip,
+    index: int,
+    options: "cli.Forecast",
+    views: list[View],
+    stages: _Stages,
+    model: "Forecaster | None" = None,
+) -> Forecast:
+    """By the network, or without one the geometric forecast."""
     stages.show("forecast", 0.0)
-    forecast: Forecast = geometric.forecast_clip(clip, index, steps, views, progress=stages.show)
-    stages.seconds |= forecast.seconds
-    return forecast
+    asked = clip, index, options.steps, views
+    if model is None:
+        from vestcl import geometric
+
+        return geometric.forecast_clip(*asked, progress=stages.show)
+    from vestcl import network
+
+    return network.forecast_clip(*asked, model, mode=options.mode or USUAL_MODE, progress=stages.show)
+
+
+def _beside(comparison: Comparison, rival: Comparison, method: str) -> Comparison:
+    """The comparison with another's forecast as a method more, right after its own."""
+    own = compare.FORECAST
+    images = {own: comparison.images[own], method: rival.images[own], **comparison.images}
+    scores = {own: comparison.scores[own], method: rival.scores[own], **comparison.scores}
+    return dataclasses.replace(comparison, images=images, scores=scores)
 
 
 def _details(
     options: "cli.Forecast", clip: Clip, index: int, forecast: Forecast, comparisons: list[Comparison]
 ) -> forecast_files.Details:
     """What forecast.json tells, and a sheet a view: beside the truth where it is known."""
-    what = f"{clip.name}, from frame {clip[index].name}, view "
+    what = f"{clip.name}, {forecast.method} forecast from frame {clip[index].name}, view "
     compared = {each.view: each for each in comparisons}
     sheets = {
         name: compare.comparison_sheet(compared[name], what + name)
@@ -209,7 +240,10 @@ def _details(
         for name in forecast.frames[0]
     }
     scores = {name: comparison.scores for name, comparison in compared.items()} if options.compare else None
-    return forecast_files.Details(options.input, dataclasses.asdict(options), scores, sheets)
+    settings = dataclasses.asdict(options)
+    if options.model is not None:
+        settings |= {"mode": options.mode or USUAL_MODE, **pretrained.about_model(options.model)}
+    return forecast_files.Details(options.input, settings, scores, sheets)
 
 
 def _score_table(comparison: Comparison) -> Table:
@@ -235,6 +269,8 @@ def _score_table(comparison: Comparison) -> Table:
 
 
 def _print_end(console: Console, saved: forecast_files.SavedForecast) -> None:
+    file = saved.about["settings"].get("model_file")
+    console.print(Text(f"forecast: {saved.about['method']}" + (f", {file}" if file else "")), soft_wrap=True)
     seconds: dict[str, float] = saved.about["seconds"]
     table = Table("stage", box=box.SIMPLE)
     table.add_column("seconds", justify="right")

@@ -129,7 +129,7 @@ def open_input(text: str, options: "cli.Prepare") -> Clip:
 
         return open_clip(cli.Forecast(text, height=options.height, width=options.width, **reader))
     if wrong := [name for name, unset in _READER.items() if reader[name] != unset]:
-        raise ValueError(f"{text}: is a street, whose depth and labels are its own; it does not take {', '.join(wrong)}")
+        raise ValueError(f"{text}: is a street, which brings depth and labels; it does not take {', '.join(wrong)}")
     seed, size = int(street[1]), (options.height, options.width)
     made, start = Street.generate(seed), 0.0
     if options.drive == "random":

@@ -1,0 +1,124 @@
+"""`vestcl forecast --model`: which forecaster runs, what it is held against, and what the files tell of it."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from forecast_clips import Repeater, write_clip
+from forecaster_scenes import TINY
+from stand_ins import put_module
+
+from vestcl import cli, pretrained
+from vestcl.data.sample import Clip
+from vestcl.forecast_files import read_forecast
+from vestcl.models.forecaster import Forecaster
+
+
+@pytest.fixture
+def network(monkeypatch: pytest.MonkeyPatch) -> Repeater:
+    """In place of the network, which foresees one frame."""
+    network = Repeater("tiny", shift=1)
+    put_module(monkeypatch, "vestcl.network", forecast_clip=network)
+    monkeypatch.setenv("COLUMNS", "200")
+    return network
+
+
+@pytest.fixture
+def geometric(monkeypatch: pytest.MonkeyPatch) -> Repeater:
+    geometric = Repeater("geometric")
+    put_module(monkeypatch, "vestcl.geometric", forecast_clip=geometric)
+    return geometric
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_clip(tmp_path / "clip")
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.safetensors"
+    Forecaster(TINY).save(path)
+    return path
+
+
+def test_the_network_takes_the_geometric_ones_place(
+    folder: Path, tmp_path: Path, file: Path, network: Repeater, geometric: Repeater, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1", "--frame", "3", "--no-exr"]
+    assert cli.main([*told, "--model", str(file)]) == 0
+    assert f"forecast: tiny, {file}" in capsys.readouterr().out
+    assert not geometric.calls
+    ((model, mode),) = network.networks
+    assert isinstance(model, Forecaster) and model.config == TINY and not model.training
+    assert mode == "compose"
+    saved = read_forecast(tmp_path / "out")
+    settings = saved.about["settings"]
+    assert saved.about["method"] == "tiny"
+    assert [settings[key] for key in ("model", "mode", "model_file")] == [str(file), "compose", str(file)]
+    assert settings["model_sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
+    clip: Clip = network.calls[0][0]
+    assert np.array_equal(saved.image(1, "source"), clip[4].read_image())
+
+
+def test_feedback(folder: Path, tmp_path: Path, file: Path, network: Repeater, geometric: Repeater) -> None:
+    told = ["forecast", str(folder), "--out", str(tmp_path), "--no-exr", "--frame", "3", "--mode", "feedback"]
+    assert cli.main([*told, "--model", str(file)]) == 0
+    assert network.networks[0][1] == "feedback"
+    assert read_forecast(tmp_path).about["settings"]["mode"] == "feedback"
+
+
+def test_without_it_geometry_forecasts(folder: Path, tmp_path: Path, network: Repeater, geometric: Repeater) -> None:
+    assert cli.main(["forecast", str(folder), "--out", str(tmp_path), "--no-exr", "--compare", "--steps", "1"]) == 0
+    about = read_forecast(tmp_path).about
+    assert not network.calls and len(geometric.calls) == 1
+    assert about["method"] == "geometric" and about["settings"]["model"] is None
+    assert set(about["scores"]["source"]) == {"forecast", "repeat last", "optical flow"}
+    assert not {"model_file", "model_sha256"} & set(about["settings"])
+
+
+def test_the_geometric_one_is_scored_beside_the_networks(
+    folder: Path, tmp_path: Path, file: Path, network: Repeater, geometric: Repeater, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = f"forecast {folder} --out {tmp_path} --no-exr --compare --steps 2 --view source --view right --model {file}"
+    assert cli.main(told.split()) == 0
+    assert [call[1:3] for call in (*network.calls, *geometric.calls)] == [(3, 2), (3, 2)]
+    about = read_forecast(tmp_path).about
+    for view in ("source", "right"):
+        assert set(about["scores"][view]) == {"forecast", "geometric", "repeat last", "optical flow"}
+    scores = about["scores"]["source"]
+    assert scores["forecast"][0]["psnr"] is None  # infinite: this one foresaw the frame
+    assert scores["geometric"] == scores["repeat last"]  # as both repeat it
+    assert set(about["seconds"]) == {"open the clip", "repeat", "compare", "write the files"}
+    rows = [line.split()[0] for line in capsys.readouterr().out.splitlines() if line.strip()]
+    at = rows.index("forecast")
+    assert rows[at : at + 3] == ["forecast", "geometric", "repeat"]
+
+
+def test_a_shipped_one_is_told_by_its_name(
+    folder: Path, tmp_path: Path, file: Path, network: Repeater, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file.rename(file.with_name("vest-s.safetensors"))
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--no-exr", "--frame", "3"]
+    assert cli.main([*told, "--model", "vest-s"]) == 0
+    settings = read_forecast(tmp_path / "out").about["settings"]
+    assert (settings["model"], settings["model_file"]) == ("vest-s", "vest-s.safetensors")
+
+
+def test_missing_or_damaged_files_are_one_line(
+    folder: Path, tmp_path: Path, network: Repeater, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "weights")
+    damaged = tmp_path / "damaged.safetensors"
+    damaged.write_bytes(b"no tensors")
+    for model, message in (
+        ("vest-s", "vest-s: its weights are missing"),
+        (str(damaged), "must be a safetensors file"),
+        (str(folder), "clip: must have ema.safetensors or model.safetensors"),
+    ):
+        assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), "--model", model]) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1
+    assert not network.calls and not (tmp_path / "out").exists()
