@@ -21,7 +21,7 @@ demo: venv
 lint: venv
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy vestcl
+	$(BIN)/mypy vestcl train
 
 test: lint
 	$(BIN)/pytest -q

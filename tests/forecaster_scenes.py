@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from vestcl.models import EgoMotion, ModelConfig, ObjectMotion
+from vestcl.models import EgoMotion, ModelConfig, ObjectMotion, RigidMotion
 from vestcl.models._render import Side
 from vestcl.models.config import (
     FIXED_DEPTH,
@@ -18,6 +18,7 @@ from vestcl.models.config import (
     RoutingConfig,
 )  # fmt: skip
 from vestcl.models.forecaster import Forecaster, Step
+from vestcl.models.prior import MotionPrior
 from vestcl.scene.layers import LayerBatch
 
 OBJECTS = ObjectMotionConfig("dmvfn", scales=(2, 1), widths=(8, 8), detail=4)
@@ -38,6 +39,16 @@ def change(**fields: Any) -> ModelConfig:
     return dataclasses.replace(TINY, **fields)
 
 
+#: As vest-s in all but its sizes; TINY is as vest-paper.
+SMALL = change(
+    start="prior",
+    render=RenderConfig(rho=0.95, normalised=True),
+    refine=dataclasses.replace(TINY.refine, base="filled"),
+)
+
+#: The same, painting anew.
+PAINTING = dataclasses.replace(SMALL, refine=TINY.refine)
+
 #: Every colour shown by its own pixel alone: at rest nothing blurs.
 SHARP = change(render=RenderConfig(rho=0.95))
 
@@ -50,7 +61,8 @@ ABLATIONS = {
     "features only": change(render=RenderConfig(colour=False)),
     "joint": change(render=RenderConfig(joint=True)),
     "joint features": change(render=RenderConfig(joint=True, colour=False)),
-    "residual": change(refine=dataclasses.replace(TINY.refine, residual=True)),
+    "residual": change(refine=dataclasses.replace(TINY.refine, base="splatted")),
+    "filled": change(render=RenderConfig(normalised=True), refine=dataclasses.replace(TINY.refine, base="filled")),
     "routing": change(object_motion=dataclasses.replace(OBJECTS, routing=RoutingConfig(4, budget=1.0))),
     "paper": change(object_motion=dataclasses.replace(OBJECTS, shape="paper")),
 }
@@ -74,6 +86,31 @@ def wall(height: int, width: int, depth: float) -> LayerBatch:
     """A random picture on a wall that faces the camera."""
     image, metres = torch.rand(1, 3, height, width), torch.full((1, 1, height, width), depth)
     return LayerBatch(image, metres, torch.ones_like(metres), image, metres)
+
+
+def measured(
+    batch: int,
+    height: int,
+    width: int,
+    *,
+    prev: tuple[float, ...] = (0, 0, 0),
+    cur: tuple[float, ...] = (0, 0, 0),
+    velocity: tuple[float, ...] = (0, 0, 0),
+) -> MotionPrior:
+    """The camera's translations to t + 1 and everything's velocity, metres."""
+    still = torch.tensor([1.0, 0, 0, 0]).repeat(batch, 1)
+    from_prev, from_cur = (RigidMotion(still, torch.tensor(xyz).float().repeat(batch, 1)) for xyz in (prev, cur))
+    moving = torch.tensor(velocity).float()[:, None, None].repeat(batch, 1, height, width)
+    return MotionPrior(from_prev, from_cur, moving, moving)
+
+
+def turning(batch: int, height: int, width: int) -> MotionPrior:
+    """A bend over a bump, quaternions of any length, and everything moving its own way."""
+    first = RigidMotion(torch.tensor([[2.0, 0.02, -0.1, 0.03]]), torch.tensor([[0.3, 0.1, -2.0]]))
+    second = RigidMotion(torch.tensor([[-1.0, -0.01, 0.03, 0.01]]), torch.tensor([[0.1, 0.0, -1.0]]))
+    from_prev, from_cur = (RigidMotion(*(part.repeat(batch, 1) for part in rigid)) for rigid in (first, second))
+    velocity_prev, velocity_cur = torch.randn(2, batch, 3, height, width)
+    return MotionPrior(from_prev, from_cur, velocity_prev, velocity_cur)
 
 
 def camera(batch: int, height: int, width: int) -> torch.Tensor:

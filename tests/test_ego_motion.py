@@ -7,7 +7,8 @@ import pytest
 import torch
 from tolerances import assert_close
 
-from vestcl.models import EgoMotion, configuration
+from vestcl import geometry
+from vestcl.models import EgoMotion, RigidMotion, configuration
 from vestcl.models.config import EgoMotionConfig
 from vestcl.models.ego_motion import background_tokens, sinusoidal_positions
 
@@ -48,6 +49,42 @@ def test_named_models_start_at_rest(name: str) -> None:
     network = EgoMotion(config.ego_motion, config.encoder.features)
     for quaternion, translation in network(**scene(2, 16, 24, config.encoder.features)):
         assert quaternion.tolist() == [[1, 0, 0, 0]] * 2 and translation.tolist() == [[0, 0, 0]] * 2
+
+
+def test_named_models_start_at_the_prior() -> None:
+    """vest-s answers what it is given: exactly, for any length and sign of the quaternion."""
+    config = configuration("vest-s")
+    network = EgoMotion(config.ego_motion, config.encoder.features, config.start)
+    prior = tuple(RigidMotion(torch.randn(2, 4), torch.randn(2, 3)) for _ in range(2))
+    for got, wanted in zip(network(**scene(2, 16, 24, config.encoder.features), prior=prior), prior, strict=True):
+        assert torch.equal(got.quaternion, wanted.quaternion) and torch.equal(got.translation, wanted.translation)
+
+
+def test_one_motion_after_another() -> None:
+    """x -> R (R_first x + t_first) + t."""
+    first, second = (RigidMotion(torch.randn(2, 4).double(), torch.randn(2, 3).double()) for _ in range(2))
+    wanted = geometry.compose_rigid(*second) @ geometry.compose_rigid(*first)
+    assert_close(geometry.compose_rigid(*second.after(first)), wanted)
+
+
+def test_the_prior_has_a_gradient_and_every_tensor() -> None:
+    network = EgoMotion(SMALL, 4, "prior").double()
+    torch.nn.init.normal_(network.motion.weight)
+    prior = tuple(RigidMotion(*(torch.randn(2, n).double().requires_grad_() for n in (4, 3))) for _ in range(2))
+    output = torch.cat([part for motion in network(**scene(2, 16, 24, dtype=torch.float64), prior=prior)
+                        for part in motion], dim=1)  # fmt: skip
+    (output * torch.randn_like(output)).sum().backward()
+    given = [(f"prior {i}", part) for i, motion in enumerate(prior) for part in motion]
+    for name, tensor in [*given, *network.named_parameters()]:
+        assert tensor.grad is not None and tensor.grad.abs().max() > 1e-9, name
+
+
+@pytest.mark.parametrize("start", ["rest", "prior"])
+def test_a_prior_where_it_is_wanted(start: str) -> None:
+    rest = RigidMotion(torch.tensor([[1.0, 0, 0, 0]] * 2), torch.zeros(2, 3))
+    prior = (rest, rest) if start == "rest" else None
+    with pytest.raises(ValueError, match=f"`prior` must be {'none' if start == 'rest' else 'given'}"):
+        EgoMotion(SMALL, 4, start)(**scene(2, 8, 9), prior=prior)
 
 
 @pytest.mark.parametrize(("height", "width"), [(16, 24), (17, 23), (5, 2), (1, 1)])

@@ -4,15 +4,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from forecaster_scenes import ABLATIONS, TINY, camera, change, drive, frame, pair_of, sides_of, stir, wall
+from forecaster_scenes import ABLATIONS, TINY, camera, change, drive, frame, measured, pair_of, sides_of, stir, wall
 from safetensors.torch import save_file
 from torch import nn
 from torch.nn import functional
 
 from vestcl.models import configuration
 from vestcl.models._clouds import Cloud
-from vestcl.models._render import LEAST_COVERAGE, splat_cloud
-from vestcl.models.config import RenderConfig
+from vestcl.models._render import splat_cloud
+from vestcl.models.config import LEAST_COVERAGE, RenderConfig
 from vestcl.models.forecaster import Camera, Forecaster
 from vestcl.scene.layers import LayerBatch
 
@@ -39,7 +39,7 @@ def test_shapes_for_any_size(height: int, width: int) -> None:
 @pytest.mark.parametrize("name", ["vest-s", "vest-s+routing+joint"])
 def test_named_models(name: str) -> None:
     pair, K = pair_of(1, 32, 48), camera(1, 32, 48)
-    step = Forecaster(configuration(name))(*pair, K)
+    step = Forecaster(configuration(name))(*pair, K, prior=measured(1, 32, 48))
     assert step.views[0].image.shape == (1, 3, 32, 48)
     assert (step.motion.objects.probabilities is not None) == ("routing" in name)
 
@@ -54,8 +54,14 @@ def test_what_refinement_sees(name: str) -> None:
     render, (rendered,) = ABLATIONS[name].render, seen
     assert rendered.shape[1] == render.channels(4) == (1 if render.joint else 2) * (9 if render.colour else 4)
     assert len(sides) == (1 if render.joint else 2)
-    wanted = [plane for side in sides for plane in side[: 4 if render.colour else 1]]
-    assert torch.equal(rendered, torch.cat(wanted, dim=1))
+    wanted = []
+    for side in sides:
+        planes = list(side[: 4 if render.colour else 1])
+        if render.normalised:
+            per = side.coverage.clamp(min=LEAST_COVERAGE)
+            planes = [plane if plane is side.coverage else plane / per for plane in planes]
+        wanted += planes
+    assert torch.allclose(rendered, torch.cat(wanted, dim=1), rtol=1e-6)
 
 
 def test_a_point_a_pixel_and_one_behind_each_of_the_foreground() -> None:
@@ -104,11 +110,10 @@ def test_the_radius_has_a_gradient() -> None:
     """A point on the optical axis: coming nearer changes nothing but its size, and so what it covers."""
     points, one = torch.tensor([[0.0, 0.0, 10.0]]), torch.ones(1, 1)
     displacement = torch.tensor([[0.0, 0.0, -2.0]], requires_grad=True)
-    cloud = Cloud(
-        points, displacement, torch.zeros(1, 3), torch.tensor([10.0]), torch.ones(1, 4), one, torch.tensor([0, 1])
-    )
+    beside, starts = torch.zeros(1, 4, dtype=torch.int64), torch.tensor([0, 1])
+    cloud = Cloud(points, displacement, torch.zeros(1, 3), torch.tensor([10.0]), torch.ones(1, 4), one, beside, starts)
     still, K = torch.eye(4)[None], camera(1, 9, 9)
-    splat_cloud(cloud, Camera(still, K), K, still, 1.5, 9, 9).coverage.sum().backward()
+    splat_cloud(cloud, Camera(still, K), K, still, RenderConfig(rho=1.5), 9, 9).coverage.sum().backward()
     assert displacement.grad is not None
     assert displacement.grad[0, 2] < -0.1 and displacement.grad[0, :2].abs().max() < 1e-4
 

@@ -24,7 +24,7 @@ def test_the_paper() -> None:
     assert config.object_motion is not None and config.object_motion.shape == "paper"
     assert config.object_motion.routing is None and config.fixed_depth is None
     assert config.render.side_channels(32) == 37 and config.render.channels(32) == 74
-    assert not config.render.joint and not config.refine.residual
+    assert not config.render.joint and config.refine.base == "none"
 
 
 def test_every_variant_changes_its_own_field() -> None:
@@ -34,7 +34,11 @@ def test_every_variant_changes_its_own_field() -> None:
         "no-omf": lambda c: c.object_motion is None,
         "features-only": lambda c: not c.render.colour and c.render.channels(32) == 64,
         "joint": lambda c: c.render.joint and c.render.channels(32) == 37,
-        "residual": lambda c: c.refine.residual,
+        "residual": lambda c: c.refine.base == "splatted" and not c.render.normalised,
+        "filled": lambda c: c.refine.base == "filled" and c.render.normalised,
+        "painting": lambda c: c.refine.base == "none" and not c.render.normalised,
+        "from-rest": lambda c: c.start == "rest",
+        "from-prior": lambda c: c.start == "prior",
         "omf-paper": lambda c: c.object_motion.shape == "paper",
         "omf-dmvfn": lambda c: c.object_motion.shape == "dmvfn",
         "routing": lambda c: c.object_motion.routing == RoutingConfig(budget=4.5),
@@ -47,12 +51,13 @@ def test_every_variant_changes_its_own_field() -> None:
             different = {
                 f.name for f in dataclasses.fields(config) if getattr(config, f.name) != getattr(CONFIGS[base], f.name)
             }
-            assert len(different) <= 2  # the name, and the part that the variant is about
+            both = variant in ("features-only", "residual", "filled", "painting")  # what is rendered, what is added to
+            assert different <= {"name", "render", "refine"} if both else len(different) <= 2
 
 
 def test_variants_add_up() -> None:
     config = configuration("vest-s+joint+residual+no-emf+routing+omf-paper")
-    assert config.render.joint and config.refine.residual and config.ego_motion is None
+    assert config.render.joint and config.refine.base == "splatted" and config.ego_motion is None
     assert config.object_motion is not None
     assert config.object_motion.routing is not None and config.object_motion.shape == "paper"
 
@@ -86,7 +91,7 @@ def test_frozen_and_hashable() -> None:
         (lambda: configuration("vest-s+fast"), r"`name` may add \+fixed-depth, .*, \+routing, got '\+fast'"),
         (lambda: configuration("vest-s+"), r"got '\+'"),
         (lambda: configuration("vest-s+no-omf+routing"), "'vest-s' has no object motion to change"),
-        (lambda: configuration("vest-s+residual+features-only"), r"needs `render.colour`"),
+        (lambda: configuration("vest-s+features-only+residual"), r"needs `render.colour`"),
         (lambda: EgoMotionConfig(heads=3), r"`widths\[-1\]` must be a multiple of 4 `heads` = 12, got 256"),
         (lambda: ObjectMotionConfig(shape="vgg"), '`shape` must be "paper" or "dmvfn", got \'vgg\''),  # type: ignore[arg-type]
         (lambda: ObjectMotionConfig(scales=(4, 2)), r"`scales` and `widths` must be as long, got \(4, 2\)"),
@@ -98,9 +103,13 @@ def test_frozen_and_hashable() -> None:
             r"`routing.budget` must be in \(0, 9\), got 9.0",
         ),
         (
-            lambda: ModelConfig("mine", refine=RefineConfig(residual=True), render=RenderConfig(colour=False)),
+            lambda: ModelConfig("mine", refine=RefineConfig(base="splatted"), render=RenderConfig(colour=False)),
             r"needs `render.colour`",
         ),
+        (lambda: configuration("vest-s+features-only+filled"), r"needs `render.colour`"),
+        (lambda: RefineConfig(base="sky"), '`base` must be "none", "splatted" or "filled", got \'sky\''),  # type: ignore[arg-type]
+        (lambda: ModelConfig("mine", refine=RefineConfig(base="filled")), '"filled" needs `render.normalised`'),
+        (lambda: ModelConfig("mine", start="zero"), '`start` must be "rest" or "prior", got \'zero\''),  # type: ignore[arg-type]
         (lambda: ModelConfig("mine", fixed_depth=0.0), r"`fixed_depth` must be in \[0.1, 1000.0\] m, got 0.0"),
     ],
 )

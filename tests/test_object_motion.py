@@ -257,7 +257,7 @@ def test_the_most_probable_blocks_of_a_budget() -> None:
 def test_routing_starts_at_its_budget() -> None:
     config = configuration("vest-s+routing")
     forecast = ObjectMotion(config.object_motion, config.encoder.features)(**scene(2, 16, 32, config.encoder.features))
-    assert forecast.probabilities is not None and forecast.probabilities.shape == (2, 9)
+    assert forecast.probabilities is not None and forecast.probabilities.shape == (2, 6)
     assert 4 < forecast.probabilities.sum(dim=1).mean() < 5
 
 

@@ -2,6 +2,7 @@
 
 import contextvars
 import dataclasses
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -224,3 +225,19 @@ def test_profile_times_every_kernel(kernels: Path, fresh: runtime.Session) -> No
     scale(fresh, 4, array)
     assert [time.name for time in times] == ["scale", "scale"]
     assert all(0 < time.start_ns <= time.end_ns for time in times)
+
+
+def test_a_session_counts_the_seconds_of_its_jobs(kernels: Path, fresh: runtime.Session) -> None:
+    """From a job's first argument to its last result, once where one job is inside another."""
+    assert fresh.seconds == 0
+    start = time.perf_counter()
+    scale(fresh, 2, np.ones(100, np.float32))
+    first, around = fresh.seconds, time.perf_counter() - start
+    assert 0 < first <= around
+    start = time.perf_counter()
+    with fresh.job():
+        time.sleep(0.05)
+        scale(fresh, 2, np.ones(100, np.float32))
+        time.sleep(0.05)
+    around = time.perf_counter() - start
+    assert 0.1 <= fresh.seconds - first <= around

@@ -203,13 +203,11 @@ def test_the_present_from_the_right(tmp_path: Path, model: Path) -> None:
     settings = {"data": data, "height": SIZE[0], "width": SIZE[1], "steps": 3, "model": (model,), "sheets": False}
     told = run(protocol="kitti-space", out=tmp_path / "out", **settings)
     present = told["summary"][NOW]
-    assert set(present) == {AS_SEEN, GEOMETRIC} and len(present[GEOMETRIC]["by_horizon"]["ssim"]) == 1
+    assert set(present) == {AS_SEEN, GEOMETRIC, "tiny"} and len(present[GEOMETRIC]["by_horizon"]["ssim"]) == 1
     assert present[GEOMETRIC]["by_horizon"]["ssim"][0] > present[AS_SEEN]["by_horizon"]["ssim"][0] + 0.1
     assert "tiny" in told["summary"]["source"]
     text = (tmp_path / "out" / "results.md").read_text(encoding="utf-8")
-    assert (
-        "Models can't show the present, so the right camera at t is without tiny." in text and "view right at t" in text
-    )
+    assert "view right at t" in text
 
 
 # ---------------------------------------------------------------- the command line

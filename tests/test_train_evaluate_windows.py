@@ -8,13 +8,14 @@ import pytest
 import torch
 from forecaster_scenes import TINY, stir
 
-from train.evaluate_windows import CAMERA, Setup, forecast, known_of, prepared, show_now, views_of, window
+from train.evaluate_windows import CAMERA, Setup, forecast, known_of, prepared, presenters, views_of, window
 from train.protocols import NOW, PROTOCOLS
 from vestcl import metrics
 from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.forecast import View
 from vestcl.geometric import Perception, forecast_frames
+from vestcl.models.config import configuration
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.trunks import Trunk
 from vestcl.perceptual import LPIPS_SCALING, Lpips, squeeze_distance
@@ -87,11 +88,13 @@ def test_models_are_charged_for_what_was_seen_before_them() -> None:
     assert made["tiny"].seconds > plain.seconds - plain.forecast.seconds["render"] > 0
 
 
-def test_the_present_is_what_is_seen() -> None:
+@pytest.mark.parametrize("method", [GEOMETRIC, "model"])
+def test_the_present_is_what_is_seen(method: str) -> None:
     """From the source camera frame t itself; from the right one closer to what that sees than the source is."""
     clip = street()
     right = dataclasses.replace(parse_view("right", clip), name=NOW)
-    shown = show_now(Perception(clip), 2, [SOURCE_VIEW, right])
+    model = Forecaster(configuration("vest-s")).eval()  # untrained, it shows the splatted colour
+    shown = presenters(setup(models={"model": model}))[method](Perception(clip), 2, [SOURCE_VIEW, right])
     current, camera = clip[2].read_image(), clip[2].right
     assert camera is not None
     assert decibels(shown[SOURCE].image, current) > 30

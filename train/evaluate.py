@@ -27,7 +27,7 @@ from rich.text import Text
 
 from train import evaluate_report as report
 from train.evaluate_sheets import write_sheets
-from train.evaluate_windows import PART_WINDOWS, Part, Setup, known_of, plan, prepared, presenters, read_part, run_part
+from train.evaluate_windows import PART_WINDOWS, Part, Setup, known_of, plan, prepared, read_part, run_part
 from train.protocols import HELD_OUT, PROTOCOLS, Name, Protocol, Source, Where
 from train.ranks import Ranks
 from vestcl import __version__, runtime
@@ -228,9 +228,6 @@ def _caveats(config: Evaluation, setup: Setup) -> list[str]:
         told.append(f"Without weights, not measured: {', '.join(absent)}.")
     if min(setup.size) < MS_SSIM_SIDE:
         told.append(f"MS-SSIM needs {MS_SSIM_SIDE} pixels a side, got {setup.size[0]} x {setup.size[1]}.")
-    absent = [name for name in setup.models if name not in presenters(setup)]
-    if protocol.now and absent:
-        told.append(f"Models can't show the present, so the right camera at t is without {', '.join(absent)}.")
     plain = PROTOCOLS[config.protocol]
     changed = [f"{name} {getattr(protocol, name)}" for name in _PUBLISHED
                if getattr(protocol, name) != getattr(plain, name)]  # fmt: skip

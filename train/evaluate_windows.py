@@ -15,17 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeVar
 
-import numpy as np
-
 from train.protocols import NOW, Protocol, Source, currents
+from vestcl import network
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
-from vestcl.geometric import Perception, forecast_frames
-from vestcl.geometric.forecast import _clouds, _render
+from vestcl.geometric import Perception, forecast_frames, show_frame
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.trunks import Trunk
-from vestcl.network import forecast_frames as network_forecast_frames
 from vestcl.perceptual import Lpips
 from vestcl.scoring import (
     GEOMETRIC,
@@ -249,34 +246,25 @@ def forecast(perception: Perception, index: int, views: Sequence[View], setup: S
     made = {GEOMETRIC: Timed(plain, whole)}
     for name, model in setup.models.items():
         given = (perception, model, index, setup.steps, views)
-        own, seconds = _timed(functools.partial(network_forecast_frames, *given, mode=setup.mode))
+        own, seconds = _timed(functools.partial(network.forecast_frames, *given, mode=setup.mode))
         made[name] = Timed(own, looking + seconds)
     return made
 
 
 def presenters(setup: Setup) -> dict[str, Presenter]:
-    """The methods that can show frame t itself as other cameras see it. `Forecaster` has no such call: no model can.
+    """How each method shows frame t itself as other cameras see it.
 
     Args:
         setup: methods.
     """
-    return {GEOMETRIC: show_now}
+    shown: dict[str, Presenter] = {GEOMETRIC: show_frame}
+    for name, model in setup.models.items():
+        shown[name] = functools.partial(_network_shows, model)
+    return shown
 
 
-def show_now(perception: Perception, index: int, views: Sequence[View]) -> dict[str, Rendered]:
-    """Frame t itself as other cameras see it: the geometric forecast's clouds, moved by nothing.
-
-    Args:
-        perception: of the clip.
-        index: the current frame t.
-        views: cameras at t, ``tgt_from_next`` from the source camera there.
-
-    Returns:
-        By the views' names.
-    """
-    clip = perception.clip
-    clouds = [cloud(0, [np.eye(4)]) for cloud in _clouds(perception, index)]
-    return {view.name: _render(clouds, clip[index].K if view.K is None else view.K, view, clip) for view in views}
+def _network_shows(model: Forecaster, perception: Perception, index: int, views: Sequence[View]) -> dict[str, Rendered]:
+    return network.show_frame(perception, model, index, views)
 
 
 def _now(perception: Perception, truth: Truth, index: int, setup: Setup) -> list[Record]:

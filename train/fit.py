@@ -164,7 +164,7 @@ class _Run:
         )  # fmt: skip
         waiting = time.perf_counter()
         for batch in batches:
-            waited, rate = time.perf_counter() - waiting, trainer.schedule.get_last_lr()[0]
+            waited, rate = time.perf_counter() - waiting, float(trainer.schedule.get_last_lr()[0])
             try:
                 update = trainer.update(batch)
             except NotANumberError as error:

@@ -7,6 +7,8 @@ from typing import Final
 
 import torch
 from torch import distributed
+from torch.distributed.distributed_c10d import PrefixStore
+from torch.distributed.rendezvous import rendezvous
 
 from vestcl import runtime
 
@@ -29,7 +31,9 @@ class Ranks:
         if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
             return cls()
         if not distributed.is_initialized():
-            distributed.init_process_group("gloo", timeout=PATIENCE)
+            store, rank, world = next(rendezvous("env://", timeout=PATIENCE))
+            fresh = PrefixStore(f"start {_restarts()}", store)  # torchrun's has the lost ones' addresses
+            distributed.init_process_group("gloo", timeout=PATIENCE, store=fresh, rank=rank, world_size=world)
         return cls(distributed.get_rank(), distributed.get_world_size(), int(os.environ.get("LOCAL_RANK", "0")))
 
     @property
@@ -40,7 +44,7 @@ class Ranks:
     @property
     def restarted(self) -> bool:
         """Whether torchrun has started the processes again after one was lost."""
-        return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+        return _restarts() > 0
 
     def any(self, flag: bool) -> bool:
         """Whether it is true in any process; all get the same answer."""
@@ -72,3 +76,8 @@ class Ranks:
         """Say goodbye to the others."""
         if distributed.is_initialized():
             distributed.destroy_process_group()
+
+
+def _restarts() -> int:
+    """How often torchrun has started the processes again."""
+    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))

@@ -2,7 +2,7 @@
 
 import json
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -16,6 +16,7 @@ from train.config import Config
 from train.data import Batch
 from train.trainer import Update
 from vestcl import sheet
+from vestcl.io.atomic import write_bytes
 from vestcl.io.images import write_pixels
 from vestcl.models.forecaster import RenderedView
 
@@ -34,11 +35,12 @@ class Reporter:
     def __init__(self, config: Config, step: int, console: Console, speaks: bool) -> None:
         self.console, self._speaks, self._config = console, speaks, config
         self._recent: deque[Mapping[str, float]] = deque(maxlen=_SMOOTHED)
+        self._silenced = False
         if speaks:
             config.out.mkdir(parents=True, exist_ok=True)
             _cut_log(config.out / LOG, step)
             self._log = (config.out / LOG).open("a")
-            self._board = SummaryWriter(str(config.out / "tensorboard"), purge_step=step)
+            self._board = SummaryWriter(str(config.out / "tensorboard"), purge_step=step + 1)
 
     @contextmanager
     def bar(self, step: int) -> Iterator[None]:
@@ -57,15 +59,17 @@ class Reporter:
         if not self._speaks:
             return
         seconds = {"data": waited, **update.seconds}
-        self._recent.append({**update.terms, **{f"s_{name}": value for name, value in seconds.items()}})
+        told = {**update.terms, **{f"s_{name}": value for name, value in seconds.items()}}
+        if self._recent and self._recent[-1].keys() != told.keys():  # a stage with other terms
+            self._recent.clear()
+        self._recent.append(told)
         self._bar.update(self._task, completed=step, description=self._described(stage))
         run = self._config.run
-        if step % run.log_every == 0 or step == self._config.steps:
-            self._write(step, stage, rate, batch.horizon)
-        if run.image_every and step % run.image_every == 0 and update.view is not None:
-            picture = training_sheet(batch, update.view, f"step {step}, t+{batch.horizon}, {batch.clips[0]}")
-            write_pixels(self._config.out / "images" / f"step-{step:08d}.png", picture)
-            self._board.add_image("forecast", picture, step, dataformats="HWC")
+        with self._even_on_a_full_disk():
+            if step % run.log_every == 0 or step == self._config.steps:
+                self._write(step, stage, rate, batch.horizon)
+            if run.image_every and step % run.image_every == 0 and update.view is not None:
+                self._show(step, update.view, batch)
         if update.skipped:
             self.say(f"step {step}: no number, skipped ({', '.join(batch.clips)})", "yellow")
 
@@ -77,17 +81,35 @@ class Reporter:
     def close(self) -> None:
         """Finish the files; may be called twice."""
         if self._speaks:
-            self._log.close()
-            self._board.close()
+            with self._even_on_a_full_disk():
+                self._log.close()
+            with self._even_on_a_full_disk():
+                self._board.close()
+
+    @contextmanager
+    def _even_on_a_full_disk(self) -> Iterator[None]:
+        """What can't be written is told of once: no run is lost for its curves."""
+        try:
+            yield
+        except OSError as error:
+            if not self._silenced:
+                self.say(f"scalars and images can't be written to {self._config.out}: {error}", "red")
+            self._silenced = True
 
     def _means(self) -> dict[str, float]:
-        last = list(self._recent)[-self._config.run.log_every :]
-        return {name: float(np.mean([each[name] for each in last])) for name in last[-1]}
+        return _means_of(list(self._recent)[-self._config.run.log_every :])
 
     def _described(self, stage: str) -> str:
-        means = {name: float(np.mean([each[name] for each in self._recent])) for name in self._recent[-1]}
+        means = _means_of(self._recent)
         split = "+".join(f"{means[f's_{name}']:.2f}" for name in ("data", "networks", "splatting"))
         return f"{stage}  loss {means['loss']:.4f}  l1 {means.get('l1', 0):.4f}  {split} s data+networks+splatting"
+
+    def _show(self, step: int, view: RenderedView, batch: Batch) -> None:
+        picture = training_sheet(batch, view, f"step {step}, t+{batch.horizon}, {batch.clips[0]}")
+        folder = self._config.out / "images"
+        folder.mkdir(exist_ok=True)
+        write_pixels(folder / f"step-{step:08d}.png", picture)
+        self._board.add_image("forecast", picture, step, dataformats="HWC")
 
     def _write(self, step: int, stage: str, rate: float, horizon: int) -> None:
         means = self._means()
@@ -127,7 +149,11 @@ def _cut_log(path: Path, step: int) -> None:
     """Rows after ``step`` are of updates that a checkpoint never saw, and will be made again."""
     if path.exists():
         kept = [row for row in read_log(path) if row["step"] <= step]
-        path.write_text("".join(json.dumps(row) + "\n" for row in kept))
+        write_bytes(path, "".join(json.dumps(row) + "\n" for row in kept).encode())
+
+
+def _means_of(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[-1]}
 
 
 def _digits(value: float) -> float | None:

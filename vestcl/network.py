@@ -86,8 +86,7 @@ def forecast_frames(
         raise ValueError(f"`index` must be 1 ... {len(clip) - 1}, a frame of {clip.name} with one before, got {index}")
     if steps < 1 or not views:
         raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
-    prev, cur = prepare_frame(perception, index - 1), prepare_frame(perception, index)
-    given = network_input(prev, cur, last_motions(prev, cur))
+    given = _given(perception, index)
     tell("network")
     start = time.perf_counter()
     with torch.inference_mode():
@@ -100,6 +99,27 @@ def forecast_frames(
     motions = [step.future_from_cur[0].double().numpy() for step in done]
     seconds = perception.seconds | {"network": time.perf_counter() - start}
     return Forecast(model.config.name, motions, frames, seconds)
+
+
+def show_frame(perception: Perception, model: Forecaster, index: int, views: Sequence[View]) -> dict[str, Rendered]:
+    """A frame itself as other cameras see it, at the same time; arguments and answer as `vestcl.geometric.show_frame`.
+
+    Args:
+        perception: of the clip.
+        model: the network.
+        index: the frame t, 1 or more.
+        views: cameras at t, ``tgt_from_next`` from the source camera there.
+    """
+    given = _given(perception, index)
+    prior = given.prior if model.config.start == "prior" else None
+    with torch.inference_mode():
+        shown = model.present(given.frame_prev, given.frame_cur, given.K, cameras(views, given), prior)
+    return dict(zip((view.name for view in views), map(_rendered, shown), strict=True))
+
+
+def _given(perception: Perception, index: int) -> NetworkInput:
+    prev, cur = prepare_frame(perception, index - 1), prepare_frame(perception, index)
+    return network_input(prev, cur, last_motions(prev, cur))
 
 
 def cameras(views: Sequence[View], given: NetworkInput) -> list[tuple[torch.Tensor, torch.Tensor]]:

@@ -98,6 +98,25 @@ def forecast_frames(
     return Forecast(METHOD, cameras[:steps], frames, seconds)
 
 
+def show_frame(perception: Perception, index: int, views: Sequence[View]) -> dict[str, Rendered]:
+    """A frame itself as other cameras see it, at the same time.
+
+    Args:
+        perception: of the clip.
+        index: the frame t, 1 or more.
+        views: cameras at t, ``tgt_from_next`` from the source camera there.
+
+    Returns:
+        By the views' names.
+
+    Raises:
+        ValueError: a clip that depth can't be had for.
+    """
+    clip = perception.clip
+    clouds = [cloud(0, [np.eye(4)]) for cloud in _clouds(perception, index)]
+    return {view.name: _render(clouds, clip[index].K if view.K is None else view.K, view, clip) for view in views}
+
+
 def _extrapolate(perception: Perception, index: int, steps: int) -> list[NDArray[np.float64]]:
     """future_from_cur for each step."""
     seen = range(max(index - _MOTIONS + 1, 1), index + 1)

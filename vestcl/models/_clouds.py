@@ -134,6 +134,8 @@ def advance(cloud: Cloud, next_from_cur: torch.Tensor) -> Cloud:
     """One frame interval on: x_(k+1) = G x_k + R s_k and s_(k+1) = R s_k, with G = (R, t) = ``next_from_cur``.
 
     The camera repeats its motion G [B, 4, 4], and what has moved beside it moves on at its velocity s in the world.
+    What is fixed to the camera, x_1 = x, stays there while R = I. In a bend that is no constant velocity, and it drifts
+    by (R - I) (x - G x) in the second step: the recording car's own bonnet at 1 m and 0.01 rad a frame by 1 cm.
     """
     points = cloud.points_xyz + cloud.displacement_xyz
     turned = _per_image(cloud.step_xyz, _rotation(next_from_cur), cloud.sizes)

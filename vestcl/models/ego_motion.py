@@ -34,6 +34,12 @@ class RigidMotion(NamedTuple):
     translation: torch.Tensor
     """[B, 3] m."""
 
+    def inverse(self) -> "RigidMotion":
+        """x -> R^T (x - t)."""
+        quaternion = self.quaternion * self.quaternion.new_tensor([1.0, -1.0, -1.0, -1.0])
+        turned = (geometry.quaternion_to_matrix(quaternion) @ self.translation[..., None])[..., 0]
+        return RigidMotion(quaternion, -turned)
+
     def after(self, first: "RigidMotion") -> "RigidMotion":
         """x -> R (R_first x + t_first) + t."""
         quaternion = geometry.quaternion_multiply(self.quaternion, first.quaternion)

@@ -2,15 +2,15 @@
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import nn
 
-from vestcl import geometry
 from vestcl.models._checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models._clouds import Cloud, advance, as_image, join, lift
 from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame, check_frames, grid_depth, grid_mean, with_depth
+from vestcl.models._motion import INTERVALS, Motion, Step, arrived, next_prior, rest
 from vestcl.models._perceive import Perceive, perceive_forecast, perceive_view, straight_view
 from vestcl.models._render import (
     Camera,
@@ -25,7 +25,7 @@ from vestcl.models.config import LOG_DEPTH_FAR, ModelConfig
 from vestcl.models.ego_motion import EgoMotion, RigidMotion
 from vestcl.models.encoder import Encoder, upsample_features
 from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
-from vestcl.models.prior import MotionPrior, beside, check_prior, repeated
+from vestcl.models.prior import MotionPrior, beside, check_prior
 from vestcl.models.refine import Refine
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
@@ -35,39 +35,6 @@ __all__ = ["Camera", "Forecaster", "Mode", "Motion", "Perceive", "RenderedView",
 
 Mode = Literal["feedback", "compose"]
 Views = Sequence[tuple[torch.Tensor, torch.Tensor]]
-
-#: Frame intervals from t - 1 and from t to t + 1.
-_INTERVALS: Final = (2, 1)
-
-
-class Motion(NamedTuple):
-    """How everything moves to the next frame."""
-
-    next_from_prev: RigidMotion
-    next_from_cur: RigidMotion
-    flow0: torch.Tensor
-    """[B, 6, H, W] m: the rigid flow of the previous frame's pixels, then of the current one's."""
-    start: torch.Tensor
-    """[B, 6, H, W] m: what object motion starts from: ``flow0``, and what the prior says of things beside it."""
-    objects: ObjectMotionForecast
-    """The flow that is used, each block's candidates, which ran, their probabilities; without object motion the flow
-    is ``flow0`` and L = 0."""
-
-    @property
-    def rigid(self) -> torch.Tensor:
-        """``next_from_cur`` as [B, 4, 4]."""
-        return geometry.compose_rigid(*self.next_from_cur)
-
-
-class Step(NamedTuple):
-    """The forecast of one time, t + k."""
-
-    views: list[RenderedView]
-    """One for each camera asked for; none at steps that are not shown."""
-    motion: Motion
-    """Of the interval before t + k; when motion is composed, that of the first interval."""
-    future_from_cur: torch.Tensor
-    """[B, 4, 4] m: from the camera at t to the camera at t + k."""
 
 
 class Forecaster(nn.Module):
@@ -146,12 +113,7 @@ class Forecaster(nn.Module):
             ValueError: an argument of another shape, a depth that is not above 0, less than one step, another mode,
                 or a prior that is missing or not wanted.
         """
-        check_frames(frame_prev, frame_cur, K)
-        if (prior is None) == (self.config.start == "prior"):
-            wanted = "a `MotionPrior`" if prior is None else "None"
-            raise ValueError(f"`prior` must be {wanted} for {self.config.name}, which starts from {self.config.start}")
-        if prior is not None:
-            check_prior(prior, frame_cur.image)
+        self._check(frame_prev, frame_cur, K, prior)
         if steps < 1 or mode not in ("feedback", "compose"):
             raise ValueError(f'`steps` must be >= 1 and `mode` "feedback" or "compose", got {steps} and {mode!r}')
         straight = Camera(torch.eye(4).to(K).expand(len(K), 4, 4), K)
@@ -169,12 +131,40 @@ class Forecaster(nn.Module):
             if mode == "compose":
                 clouds = [advance(cloud, motion.rigid) for cloud in clouds]
             else:
-                view = straight_view(cameras, seen, straight) or self.show(clouds, straight, motion, K)
-                prior = None if prior is None else _next_prior(motion, view, K)
+                looked = straight_view(cameras, seen, straight) if seen else None
+                view = looked or self.show(clouds, straight, motion, K)
+                prior = None if prior is None else next_prior(motion, view, K)
                 prev, cur = cur, self.encode(perceive_view(view, perceive or perceive_forecast))
                 motion = self.move(prev, cur, K, prior)
                 clouds = self.lift(prev, cur, motion, K)
             future_from_cur = motion.rigid @ future_from_cur
+
+    def present(
+        self, frame_prev: LayerBatch, frame_cur: LayerBatch, K: torch.Tensor, views: Views, prior: MotionPrior | None
+    ) -> list[RenderedView]:
+        """Frame t itself from other cameras: what t shows stays where it is, and what t - 1 shows comes to t.
+
+        cur_from_prev is the prior's, or else the network's, next_from_cur^-1 next_from_prev.
+
+        Args:
+            frame_prev: B frames at t - 1.
+            frame_cur: the same at t.
+            K: [B, 3, 3] px, of both.
+            views: the cameras to show, as (tgt_from_cur [B, 4, 4], K [B, 3, 3]).
+            prior: as of `forecast`.
+
+        Returns:
+            A view a camera; differentiable.
+
+        Raises:
+            ValueError: as `forecast`.
+        """
+        self._check(frame_prev, frame_cur, K, prior)
+        cameras = [checked_camera(camera, len(K)) for camera in views]
+        prev, cur = self.encode(frame_prev), self.encode(frame_cur)
+        motion = arrived(prev, cur, K, self.move_camera(prev, cur, prior) if prior is None else prior)
+        clouds = self.lift(prev, cur, motion, K)
+        return [self.show(clouds, camera, motion, K) for camera in cameras]
 
     # ---------------------------------------------------------------- the figure, from left to right
 
@@ -229,8 +219,7 @@ class Forecaster(nn.Module):
     ) -> tuple[RigidMotion, RigidMotion]:
         """EMF on the encoder's grid: ``next_from_prev`` and ``next_from_cur``; rest where the model has none."""
         if self.ego_motion is None:
-            rest = _rest(cur.features)
-            return rest, rest
+            return rest(cur.features), rest(cur.features)
         frames = prev, cur
         return self.ego_motion(
             *(frame.background_grid for frame in frames),
@@ -283,7 +272,7 @@ class Forecaster(nn.Module):
         """
         rigid = motion.next_from_prev, motion.next_from_cur
         flows, flows0 = motion.objects.flow.split(3, dim=1), motion.flow0.split(3, dim=1)
-        clouds = [lift(*arguments, K) for arguments in zip((prev, cur), rigid, flows, flows0, _INTERVALS, strict=True)]
+        clouds = [lift(*arguments, K) for arguments in zip((prev, cur), rigid, flows, flows0, INTERVALS, strict=True)]
         return [join(*clouds)] if self.config.render.joint else clouds
 
     def show(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> RenderedView:
@@ -313,6 +302,14 @@ class Forecaster(nn.Module):
         planes = [refined_channels(side, render.colour, render.normalised) for side in sides]
         with self._autocast():
             return self.refine(torch.cat(planes, dim=1)).to(planes[0].dtype)
+
+    def _check(self, frame_prev: LayerBatch, frame_cur: LayerBatch, K: torch.Tensor, prior: MotionPrior | None) -> None:
+        check_frames(frame_prev, frame_cur, K)
+        if (prior is None) == (self.config.start == "prior"):
+            wanted = "a `MotionPrior`" if prior is None else "None"
+            raise ValueError(f"`prior` must be {wanted} for {self.config.name}, which starts from {self.config.start}")
+        if prior is not None:
+            check_prior(prior, frame_cur.image)
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast("cpu", self.autocast, enabled=self.autocast is not None)
@@ -345,15 +342,3 @@ class Forecaster(nn.Module):
         except RuntimeError as error:
             raise ValueError(f"`path` must hold the weights of {config.name}, got {path} ({error})") from error
         return model.eval()
-
-
-def _next_prior(motion: Motion, seen: RenderedView, K: torch.Tensor) -> MotionPrior:
-    """Of the step after ``motion``, from which the source camera has ``seen`` the result."""
-    moved = (motion.objects.flow - motion.flow0)[:, 3:]
-    return repeated(motion.next_from_cur, moved, seen, K)
-
-
-def _rest(like: torch.Tensor) -> RigidMotion:
-    """No motion, for each image of ``like`` [B, ...]."""
-    quaternion = like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(like), 1)
-    return RigidMotion(quaternion, like.new_zeros(len(like), 3))

@@ -1,0 +1,251 @@
+"""train.fit: nothing is lost when a run is killed or told to stop, and what breaks is told of."""
+
+import errno
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from train_scenes import MODELS, Processes, configured, steps, street, write_yaml
+
+from train import checkpoint, fit, losses, trainer
+from train.checkpoint import CheckpointError
+from train.fit import STOPPED, TrainingError
+from train.report import LOG, read_log
+from vestcl.models import ObjectMotion, config
+from vestcl.models._checkpoint import write_checkpoint
+from vestcl.models.forecaster import Forecaster
+
+KILLED = -9
+
+#: Moments at which one run is killed, one after the other, and its checkpoints then: before there is one, between two,
+#: while the last one of a stage is written, when that is written but nameless, when it is done, and at the end.
+KILLS: tuple[tuple[str, list[int]], ...] = (
+    ("SIGKILL update 1", []),
+    ("SIGKILL update 3", [2]),
+    ("SIGKILL write 4", [2]),
+    ("SIGKILL publish 4", [2]),
+    ("SIGKILL prune 4", [4, 2]),
+    ("SIGKILL update 7", [6, 4, 2]),
+    ("SIGKILL write 8", [6, 4, 2]),
+)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return street(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def processes(tmp_path_factory: pytest.TempPathFactory) -> Processes:
+    return Processes(tmp_path_factory.mktemp("processes"))
+
+
+@pytest.fixture(scope="module")
+def whole(cache: Path, processes: Processes, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that nothing interrupted."""
+    folder = tmp_path_factory.mktemp("whole")
+    status = processes.train(str(write_yaml(folder / "run.yaml", cache, folder / "out")))
+    assert status == 0, processes.output
+    return folder / "out"
+
+
+@pytest.fixture
+def models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The small networks have names in this process."""
+    monkeypatch.setattr(config, "CONFIGS", MODELS)
+
+
+def run(cache: Path, out: Path, *, go_on: bool = False, **changes: Any) -> bool:
+    """In this process, whose threads are left as they are."""
+    asked = {"threads": None, **changes.pop("run", {})}
+    return fit.fit(configured(cache, out, run=asked, **changes), go_on=go_on)
+
+
+# ---------------------------------------------------------------- killed, stopped, resumed
+
+
+def test_killed_at_any_moment_it_comes_to_the_same_weights(
+    cache: Path, processes: Processes, whole: Path, tmp_path: Path
+) -> None:
+    file, out = str(write_yaml(tmp_path / "run.yaml", cache, tmp_path / "out")), tmp_path / "out"
+    for moment, left in KILLS:
+        assert processes.train(file, "--resume", moment=moment) == KILLED, (moment, processes.output)
+        assert steps(out) == left, moment
+    assert processes.train(file, "--resume") == 0, processes.output
+    assert_same_run(out, whole)
+
+
+def test_told_to_stop_it_saves_and_leaves(cache: Path, processes: Processes, whole: Path, tmp_path: Path) -> None:
+    """In either stage, between checkpoints."""
+    file, out = str(write_yaml(tmp_path / "run.yaml", cache, tmp_path / "out")), tmp_path / "out"
+    assert processes.train(file, moment="SIGTERM update 3") == STOPPED == 143
+    assert steps(out) == [3, 2] and "stopped after step 3; --resume goes on" in processes.output
+    assert processes.train(file, "--resume", moment="SIGTERM update 5") == STOPPED
+    assert steps(out)[0] == 5
+    assert processes.train(file, "--resume") == 0
+    assert "from step 5 to step 8" in processes.output
+    assert_same_run(out, whole)
+
+
+def assert_same_run(out: Path, wanted: Path) -> None:
+    """Weights, running mean, optimiser and schedule are the same bits, and so is every scalar but the seconds."""
+    got, straight = checkpoint.load_latest(out), checkpoint.load_latest(wanted)
+    assert got is not None and straight is not None and got.step == straight.step == 8
+    for name in ("model", "ema", "optimiser", "scheduler", "extra"):
+        assert_same(getattr(got, name), getattr(straight, name), name)
+    rows, others = (
+        [{key: value for key, value in row.items() if not key.startswith("s_")} for row in read_log(folder / LOG)]
+        for folder in (out, wanted)
+    )
+    assert [row["step"] for row in rows] == list(range(1, 9))
+    assert rows == others
+
+
+def assert_same(got: Any, wanted: Any, where: str) -> None:
+    if isinstance(wanted, Mapping):
+        assert got.keys() == wanted.keys(), where
+        for key in wanted:
+            assert_same(got[key], wanted[key], f"{where}.{key}")
+    elif isinstance(wanted, torch.Tensor):
+        assert torch.equal(got, wanted), where
+    elif isinstance(wanted, list):
+        for one, other in zip(got, wanted, strict=True):
+            assert_same(one, other, where)
+    else:
+        assert got == wanted, where
+
+
+def test_a_run_learns_in_each_stage_what_that_may(models: None, whole: Path) -> None:
+    """Until step 4 object motion is as it was made; afterwards it moves, too."""
+    states = {int(path.name[5:]): Forecaster.load(path / "model.safetensors") for path in
+              checkpoint.list_checkpoints(whole)}  # fmt: skip
+    before = dict(states[2].named_parameters())
+    moved = {name.split(".")[0] for name, value in states[4].named_parameters() if not torch.equal(value, before[name])}
+    assert moved == {"encoder", "ego_motion", "refine"}
+    for step, still in ((4, True), (8, False)):
+        objects = states[step].object_motion
+        assert isinstance(objects, ObjectMotion)
+        with torch.no_grad():
+            assert objects.changes_nothing == still
+
+
+def test_a_finished_run_is_finished(models: None, cache: Path, whole: Path) -> None:
+    before = checkpoint.load_latest(whole)
+    assert run(cache, whole, go_on=True)
+    after = checkpoint.load_latest(whole)
+    assert before is not None and after is not None
+    assert_same(after.model, before.model, "model")
+    assert [row["step"] for row in read_log(whole / LOG)] == list(range(1, 9))
+
+
+def test_a_run_is_not_begun_twice(models: None, cache: Path, whole: Path) -> None:
+    with pytest.raises(ValueError, match=r"has a run already: --resume goes on with it, or take another folder"):
+        run(cache, whole)
+    with pytest.raises(ValueError, match="`seed` was 0, is 1"):
+        run(cache, whole, go_on=True, seed=1)
+
+
+def test_the_command_tells_what_is_wrong(
+    models: None, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write_yaml(tmp_path / "run.yaml", tmp_path / "nothing", tmp_path / "out")
+    assert fit.main([str(file)]) == 1
+    assert "error:" in (printed := capsys.readouterr().out) and "nothing" in printed
+    assert fit.main([str(file), "stages.ego.stps=3"]) == 1
+    assert "stps" in capsys.readouterr().out
+    assert fit.main([str(tmp_path / "absent.yaml")]) == 1
+    assert "absent.yaml" in capsys.readouterr().out
+    assert not (tmp_path / "out" / "checkpoints").exists()
+
+
+# ---------------------------------------------------------------- no number
+
+
+@pytest.fixture(params=["loss", "gradient"])
+def broken(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, models: None) -> None:
+    """The fourth update's loss, or a gradient of it, is no number."""
+    calls = [0]
+
+    def total_loss(view: Any, *others: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        calls[0] += 1
+        total, terms = losses.total_loss(view, *others)
+        if calls[0] == 4 and request.param == "loss":
+            total = total * torch.nan
+        if calls[0] == 4 and request.param == "gradient":
+            view.image.register_hook(lambda grad: grad * torch.nan)
+        return total, terms
+
+    monkeypatch.setattr(trainer, "total_loss", total_loss)
+
+
+def test_no_number_stops(broken: None, cache: Path, tmp_path: Path) -> None:
+    """The step, what was shown, and where to go on from."""
+    settings = configured(cache, tmp_path)
+    windows = fit.window_set(settings.data)
+    shown = ", ".join(windows.label(draw) for draw in windows.global_batch(0, 3, 2))
+    with pytest.raises(TrainingError) as error:
+        run(cache, tmp_path)
+    told = str(error.value)
+    assert told.startswith("step 4: a loss or gradient is not a number (loss ") and "nan" in told
+    assert f"with {shown}; the last good checkpoint is {tmp_path / 'checkpoints' / 'step-00000002'}" in told
+    assert "`run.on_nan=skip`" in told
+    assert steps(tmp_path) == [2]
+
+
+def test_no_number_is_left_out(broken: None, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The weights and their mean stay for that step, and the run goes on."""
+    assert run(cache, tmp_path, run={"on_nan": "skip", "checkpoint_every": 1})
+    assert "step 4: no number, skipped (" in capsys.readouterr().out
+    for name in ("model", "ema"):
+        kept = {int(path.name[5:]): Forecaster.load(path / f"{name}.safetensors").state_dict() for path in
+                checkpoint.list_checkpoints(tmp_path)}  # fmt: skip
+        assert_same(kept[4], kept[3], name)
+        assert any(not torch.equal(kept[5][key], kept[4][key]) for key in kept[4])
+        assert all(value.isfinite().all() for value in kept[8].values())
+    rows = read_log(tmp_path / LOG)
+    assert rows[3]["gradient"] is None and all(rows[i]["gradient"] is not None for i in (0, 2, 4, 7))
+
+
+# ---------------------------------------------------------------- a full disk
+
+
+def fill_disk(monkeypatch: pytest.MonkeyPatch, full: tuple[int, ...]) -> None:
+    """Checkpoints of these steps find no room."""
+    save, write, step = checkpoint.save, write_checkpoint, [0]
+
+    def saving(out: Path | str, state: checkpoint.State, keep: int = 3) -> Path:
+        step[0] = state.step
+        return save(out, state, keep)
+
+    def writing(*arguments: Any) -> None:
+        if step[0] in full:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(*arguments)
+
+    monkeypatch.setattr(checkpoint, "save", saving)
+    monkeypatch.setattr(checkpoint, "write_checkpoint", writing)
+
+
+def test_a_full_disk_is_told_and_training_goes_on(
+    models: None, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fill_disk(monkeypatch, (2, 6))
+    assert run(cache, tmp_path)
+    assert steps(tmp_path) == [8, 4]
+    printed = capsys.readouterr().out
+    assert "step 2: checkpoint" in printed and "No space left" in printed and "step 6: checkpoint" in printed
+
+
+def test_a_full_disk_at_the_end_is_an_error(
+    models: None, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill_disk(monkeypatch, (8,))
+    with pytest.raises(CheckpointError, match=r"step-00000008 could not be written: No space left"):
+        run(cache, tmp_path)
+    assert steps(tmp_path) == [6, 4, 2]
+    monkeypatch.undo()
+    monkeypatch.setattr(config, "CONFIGS", MODELS)
+    assert run(cache, tmp_path, go_on=True) and steps(tmp_path)[0] == 8
