@@ -50,6 +50,8 @@ class Window:
     """[4, 4] m: the target's camera beside the source camera at t + k; the identity if it is the source camera."""
     future_from_cur: Matrix | None
     """[4, 4] m: the camera's true motion from t to t + k; None where it is not known."""
+    path_from_cur: tuple[Matrix, ...] = ()
+    """The same to t + 1, t + 2 ...; none where a pose is unknown."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -136,6 +138,7 @@ def flip(window: Window) -> Window:
         cur=_mirror_motion(turned.cur),
         tgt_from_next=_conjugate(turned.tgt_from_next),
         future_from_cur=None if turned.future_from_cur is None else _conjugate(turned.future_from_cur),
+        path_from_cur=tuple(map(_conjugate, turned.path_from_cur)),
     )
 
 

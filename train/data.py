@@ -47,6 +47,8 @@ class Batch(NamedTuple):
     """[B, 3, 3] px."""
     future_from_cur: torch.Tensor
     """[B, 4, 4] m: the camera's true motion from t to t + k; the identity where it is not known."""
+    path_from_cur: torch.Tensor
+    """[B, K, 4, 4] m: the same to t + 1 ... t + K, as many as there are horizons."""
     pose_known: torch.Tensor
     """[B] bool: where it is."""
     clips: tuple[str, ...]
@@ -161,7 +163,8 @@ class WindowSet:
             _matrices([window.tgt_from_next for window in windows]),
             _matrices([window.target_K for window in windows]),
             _matrices([np.eye(4) if pose is None else pose for pose in poses]),
-            torch.tensor([pose is not None for pose in poses]),
+            torch.stack([self._path(window) for window in windows]),
+            torch.tensor([bool(window.path_from_cur) for window in windows]),
             tuple(self.label(draw) for draw in draws),
         )
 
@@ -174,7 +177,7 @@ class WindowSet:
             raise ValueError(f"frame {clip.frame_name(later)} must be of size {clip.size}, got {image.shape[1:]}")
         here, there = clip.world_from_cam(draw.frame), clip.world_from_cam(later)
         future_from_cur = None if here is None or there is None else np.asarray(np.linalg.inv(there) @ here, np.float64)
-        return Window(prev, cur, image, K, tgt_from_next, future_from_cur)
+        return Window(prev, cur, image, K, tgt_from_next, future_from_cur, self._poses(clip, draw.frame))
 
     def augmented(self, window: Window, rng: np.random.Generator) -> Window:
         """Cut out, shrunk, mirrored and coloured as the settings say, by numbers from ``rng``."""
@@ -199,6 +202,17 @@ class WindowSet:
         """ "clip name/name of frame t"."""
         clip = self.clips[draw.clip]
         return f"{clip.name}/{clip.frame_name(draw.frame)}"
+
+    def _poses(self, clip: PreparedClip, frame: int) -> tuple[NDArray[np.float64], ...]:
+        """future_from_cur for k = 1 ... K; none where a pose is unknown."""
+        poses = [clip.world_from_cam(frame + k) for k in range(len(self.horizons) + 1)]
+        known = [pose for pose in poses if pose is not None]
+        if len(known) < len(poses):
+            return ()
+        return tuple(np.asarray(np.linalg.inv(pose) @ known[0], np.float64) for pose in known[1:])
+
+    def _path(self, window: Window) -> torch.Tensor:
+        return _matrices(window.path_from_cur or [np.eye(4)] * len(self.horizons))
 
     def _draw(self, seed: int, position: int, horizon: int) -> Draw:
         epoch, place = divmod(position, len(self.windows))

@@ -59,8 +59,8 @@ def total_loss(
         l1               mean |image - target|
         perceptual       mean over samples of perceptual(image, target)
         ssim             `ssim_loss`
-        rotation         `pose_errors`, rad; weight ``pose.rotation``
-        translation      `pose_errors`, m; weight ``pose.translation``
+        rotation         `path_errors`, rad; weight ``pose.rotation``
+        translation      `path_errors`, m; weight ``pose.translation``
         residual_motion  `residual_motion`
 
     Args:
@@ -77,7 +77,7 @@ def total_loss(
     Raises:
         ValueError: shapes don't fit, or ``perceptual`` is missing.
     """
-    rotation, translation = pose_errors(step.future_from_cur, batch.future_from_cur, batch.pose_known)
+    rotation, translation = path_errors(step.path_from_cur, batch.path_from_cur, batch.pose_known)
     terms = {} if view is None else _image_terms(view.image, batch.target, config, perceptual)
     terms |= {
         "rotation": (config.pose.rotation, rotation),
@@ -114,6 +114,22 @@ def ssim_loss(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
             prediction, target = functional.avg_pool2d(prediction, 2), functional.avg_pool2d(target, 2)
         similarity = similarity + weight / sum(levels) * metrics.ssim(prediction, target).mean()
     return 1 - similarity
+
+
+def path_errors(path: torch.Tensor, truth: torch.Tensor, known: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """`pose_errors`, means over the frame intervals that both ways have.
+
+    Args:
+        path: [B, m, 4, 4] m, from t to t + 1 ... t + m, the forecast.
+        truth: [B, n, 4, 4] m.
+        known: [B] bool.
+
+    Returns:
+        Radians and metres, a number each; differentiable in both ways.
+    """
+    steps = min(path.shape[1], truth.shape[1])
+    first, second = (way[:, :steps].flatten(0, 1) for way in (path, truth))
+    return pose_errors(first, second, known.repeat_interleave(steps))
 
 
 def pose_errors(

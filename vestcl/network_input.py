@@ -61,8 +61,9 @@ def network_input(prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.fl
     next_from_cur = constant_velocity(motions)
     next_from_prev = next_from_cur @ motions[-1]
     prior = MotionPrior(
-        as_motion(next_from_prev),
         as_motion(next_from_cur),
+        as_motion(motions[-1]),
+        as_motion(motions[-2] if len(motions) > 1 else motions[-1]),
         torch.from_numpy(_velocity(prev, next_from_prev, 2)[None]),
         torch.from_numpy(_velocity(cur, next_from_cur, 1)[None]),
     )

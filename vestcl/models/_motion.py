@@ -8,7 +8,7 @@ from vestcl import geometry
 from vestcl.models._clouds import as_image
 from vestcl.models._frames import EncodedFrame
 from vestcl.models._render import RenderedView
-from vestcl.models.ego_motion import RigidMotion
+from vestcl.models.ego_motion import CameraMotion, RigidMotion
 from vestcl.models.object_motion import ObjectMotionForecast
 from vestcl.models.prior import MotionPrior, repeated
 from vestcl.ops.rigid_flow import rigid_flow
@@ -23,6 +23,8 @@ class Motion(NamedTuple):
 
     next_from_prev: RigidMotion
     next_from_cur: RigidMotion
+    later: tuple[RigidMotion, ...]
+    """The camera's, of the intervals after t + 1, as far as they were forecast in one go."""
     flow0: torch.Tensor
     """[B, 6, H, W] m: the rigid flow of the previous frame's pixels, then of the current one's."""
     start: torch.Tensor
@@ -36,6 +38,18 @@ class Motion(NamedTuple):
         """``next_from_cur`` as [B, 4, 4]."""
         return geometry.compose_rigid(*self.next_from_cur)
 
+    def following(self) -> "Motion":
+        """With the next interval's motion of the camera for ``next_from_cur``: the last one repeats."""
+        return self._replace(next_from_cur=self.later[0], later=self.later[1:]) if self.later else self
+
+    def path(self, steps: int) -> torch.Tensor:
+        """future_from_cur [B, steps, 4, 4] m, to t + 1 ... t + steps, or further as far as ``later`` goes."""
+        motion, path = self, [self.rigid]
+        while len(path) < max(steps, 1 + len(self.later)):
+            motion = motion.following()
+            path.append(motion.rigid @ path[-1])
+        return torch.stack(path, dim=1)
+
 
 class Step(NamedTuple):
     """The forecast of one time, t + k."""
@@ -43,29 +57,32 @@ class Step(NamedTuple):
     views: list[RenderedView]
     """One for each camera asked for; none at steps that are not shown."""
     motion: Motion
-    """Of the interval before t + k; when motion is composed, that of the first interval."""
+    """Of the interval before t + k; when motion is composed, all but the camera's is that of the first interval."""
     future_from_cur: torch.Tensor
     """[B, 4, 4] m: from the camera at t to the camera at t + k."""
+    path_from_cur: torch.Tensor
+    """[B, n, 4, 4] m: the camera's way as it was forecast at t, to t + 1 ... t + n, n as many as steps or more."""
 
 
-def next_prior(motion: Motion, seen: RenderedView, K: torch.Tensor) -> MotionPrior:
+def next_prior(prior: MotionPrior, motion: Motion, seen: RenderedView, K: torch.Tensor) -> MotionPrior:
     """Of the step after ``motion``, from which the source camera has ``seen`` the result."""
     moved = (motion.objects.flow - motion.flow0)[:, 3:]
-    return repeated(motion.next_from_cur, moved, seen, K)
+    return repeated(prior, motion.next_from_cur, moved, seen, K)
 
 
-def arrived(
-    prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, to_next: MotionPrior | tuple[RigidMotion, RigidMotion]
-) -> Motion:
+def arrived(prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, to_next: MotionPrior | CameraMotion) -> Motion:
     """The motion that brings what t - 1 shows to t, and leaves alone what t shows.
 
     Args:
         prev: frame at t - 1.
         cur: frame at t.
         K: [B, 3, 3] px.
-        to_next: next_from_prev and next_from_cur; of a prior, what moves beside the camera comes along, too.
+        to_next: the camera's motion, or a prior, of which what moves beside the camera comes along, too.
     """
-    cur_from_prev, still = to_next[1].inverse().after(to_next[0]), rest(cur.features)
+    if isinstance(to_next, MotionPrior):
+        cur_from_prev = to_next.cur_from_prev
+    else:
+        cur_from_prev = to_next.next_from_cur.inverse().after(to_next.next_from_prev)
     height, width = cur.features.shape[2:]
     of_prev = as_image(rigid_flow(unproject(prev.layers.depth, K), *cur_from_prev), height, width)
     flow0 = torch.cat([of_prev, torch.zeros_like(of_prev)], dim=1)
@@ -75,7 +92,7 @@ def arrived(
         beside = torch.einsum("bij,bjhw->bihw", turn, to_next.velocity_prev)
         flow = flow0 + torch.cat([beside, torch.zeros_like(beside)], dim=1)
     none = torch.zeros(len(flow), 0, dtype=torch.bool)
-    return Motion(cur_from_prev, still, flow0, flow, ObjectMotionForecast(flow, [], none, None))
+    return Motion(cur_from_prev, rest(cur.features), (), flow0, flow, ObjectMotionForecast(flow, [], none, None))
 
 
 def rest(like: torch.Tensor) -> RigidMotion:

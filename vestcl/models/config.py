@@ -73,10 +73,14 @@ class EgoMotionConfig:
     heads: int = 4
     mlp_ratio: int = 4
     """Hidden units of a block's MLP over channels of a token."""
+    path: int = 1
+    """Frame intervals ahead that the camera's motion is forecast for in one go; more than one needs a prior."""
 
     def __post_init__(self) -> None:
         if (channels := 2 * self.widths[-1]) % (4 * self.heads):
             raise ValueError(f"2 `widths[-1]` must be a multiple of 4 `heads` = {4 * self.heads}, got {channels}")
+        if self.path < 1:
+            raise ValueError(f"`path` must be 1 or more, got {self.path}")
 
 
 @dataclass(frozen=True)
@@ -179,6 +183,8 @@ class ModelConfig:
     def __post_init__(self) -> None:
         if self.start not in ("rest", "prior"):
             raise ValueError(f'`start` must be "rest" or "prior", got {self.start!r}')
+        if self.start == "rest" and self.ego_motion is not None and self.ego_motion.path > 1:
+            raise ValueError(f'`ego_motion.path` must be 1 with `start` "rest", got {self.ego_motion.path}')
         if self.refine.base != "none" and not self.render.colour:
             raise ValueError("`refine.base` adds to the rendered colour, so it needs `render.colour`")
         if self.refine.base == "filled" and not self.render.normalised:
@@ -192,7 +198,7 @@ VEST_PAPER: Final = ModelConfig("vest-paper")
 VEST_S: Final = ModelConfig(
     "vest-s",
     encoder=EncoderConfig(widths=(24, 48, 96), blocks=(2, 2, 2), decoder=(48, 32), features=16),
-    ego_motion=EgoMotionConfig(widths=(32, 32, 64, 64)),
+    ego_motion=EgoMotionConfig(widths=(32, 32, 64, 64), path=5),
     object_motion=ObjectMotionConfig("dmvfn", scales=(4, 4, 2, 2, 1, 1), widths=(64, 64, 32, 32, 16, 16), detail=8),
     render=RenderConfig(rho=RHO_DIRECT, stretched=True, normalised=True),
     refine=RefineConfig(stem=16, stem_kernel=3, widths=(32, 64, 96, 128), base="filled"),
@@ -208,6 +214,11 @@ def _change_object_motion(config: ModelConfig, **fields: object) -> ModelConfig:
         raise ValueError(f"{config.name!r} has no object motion to change")
     changed = dataclasses.replace(config.object_motion, **fields)  # type: ignore[arg-type]
     return dataclasses.replace(config, object_motion=changed)
+
+
+def _from_rest(config: ModelConfig) -> ModelConfig:
+    camera = config.ego_motion and dataclasses.replace(config.ego_motion, path=1)
+    return dataclasses.replace(config, ego_motion=camera, start="rest")
 
 
 def _without_colour(config: ModelConfig) -> ModelConfig:
@@ -230,7 +241,7 @@ VARIANTS: Final[Mapping[str, Callable[[ModelConfig], ModelConfig]]] = MappingPro
         "residual": lambda c: _change_base(c, "splatted"),
         "filled": lambda c: _change_base(c, "filled"),
         "painting": lambda c: _change_base(c, "none"),
-        "from-rest": lambda c: dataclasses.replace(c, start="rest"),
+        "from-rest": _from_rest,
         "from-prior": lambda c: dataclasses.replace(c, start="prior"),
         "omf-paper": lambda c: _change_object_motion(c, shape="paper"),
         "omf-dmvfn": lambda c: _change_object_motion(c, shape="dmvfn"),

@@ -22,8 +22,15 @@ LONGEST_WAVE: Final = 10_000.0
 #: A prior's rotations, radians, are shown to the network times that, and are then as large as its translations, metres.
 _TURN_SHOWN: Final = 100.0
 
+#: What the network says of a correction is times that, radians and metres: the largest that a car makes in an interval,
+#: so that Adam's first steps, all of one size, are small ones of motion.
+_TURN_SAID, _SHIFT_SAID = 0.03, 0.1
+
 #: No motion: the quaternion (1, 0, 0, 0) and the translation 0.
 _REST: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+#: Of a small motion: rotation vector and translation.
+_NUMBERS: Final = 6
 
 
 class RigidMotion(NamedTuple):
@@ -47,6 +54,15 @@ class RigidMotion(NamedTuple):
         return RigidMotion(quaternion, turned + self.translation)
 
 
+class CameraMotion(NamedTuple):
+    """The camera's way."""
+
+    next_from_prev: RigidMotion
+    next_from_cur: RigidMotion
+    later: tuple[RigidMotion, ...] = ()
+    """From t + 1 to t + 2, and so on, as far as it is forecast in one go; then the last one repeats."""
+
+
 class EgoMotion(nn.Module):
     """Two backgrounds -> the camera's motion from each of them to the next frame.
 
@@ -55,8 +71,10 @@ class EgoMotion(nn.Module):
     goes through a linear layer whose weight starts at 0 and whose bias is rest. Foreground is neither looked at by
     other tokens nor part of the mean, unless there is nothing else.
 
-    With ``start`` "prior" the answer is a motion after the prior one, at first the prior itself, and a linear layer
-    of the prior's numbers is added to every token.
+    With ``start`` "prior" it corrects a motion that was measured and extrapolated: G_k = D_k G with k = 1 ... path, for
+    the intervals after t. D_k is the sum of a linear layer of the mean token, and one of the last two motions' numbers:
+    how a car sways on is nearly linear in how it did. Both are 0 at the start. The motions' numbers are added to every
+    token, too. next_from_prev is G_1 after the measured motion from t - 1 to t.
 
     Source: SPEC section 4; the paper's section on ego-motion forecasting.
     """
@@ -76,12 +94,19 @@ class EgoMotion(nn.Module):
         self.blocks = nn.ModuleList(
             AttentionBlock(tokens, config.heads, config.mlp_ratio) for _ in range(config.blocks)
         )
-        self.shown = nn.Linear(2 * (len(_REST) - 1), tokens) if start == "prior" else None
         self.norm = nn.LayerNorm(tokens)
-        self.motion = nn.Linear(tokens, 2 * len(_REST))
-        with torch.no_grad():
-            self.motion.weight.zero_()
-            self.motion.bias.copy_(torch.tensor(_REST).repeat(2))
+        self.shown, self.swayed = None, None
+        if start == "prior":
+            self.shown = nn.Linear(2 * _NUMBERS, tokens)
+            self.swayed = nn.Linear(2 * _NUMBERS, config.path * _NUMBERS, bias=False)
+            self.motion = nn.Linear(tokens, config.path * _NUMBERS)
+            nn.init.zeros_(self.swayed.weight)
+            nn.init.zeros_(self.motion.bias)
+        else:
+            self.motion = nn.Linear(tokens, 2 * len(_REST))
+            with torch.no_grad():
+                self.motion.bias.copy_(torch.tensor(_REST).repeat(2))
+        nn.init.zeros_(self.motion.weight)
 
     def forward(
         self,
@@ -91,8 +116,8 @@ class EgoMotion(nn.Module):
         depth_cur: torch.Tensor,
         mask_prev: torch.Tensor,
         mask_cur: torch.Tensor,
-        prior: tuple[RigidMotion, RigidMotion] | None = None,
-    ) -> tuple[RigidMotion, RigidMotion]:
+        prior: tuple[RigidMotion, RigidMotion, RigidMotion] | None = None,
+    ) -> CameraMotion:
         """Forecast the camera's motion. All arguments are on the encoder's grid, h x w, of any size.
 
         Args:
@@ -102,10 +127,11 @@ class EgoMotion(nn.Module):
             depth_cur: the same at t.
             mask_prev: [B, 1, h, w], 1 where the frame itself shows static background.
             mask_cur: the same at t.
-            prior: ``next_from_prev`` and ``next_from_cur`` to start from, with ``start`` "prior".
+            prior: with ``start`` "prior" ``next_from_cur`` to start from, ``cur_from_prev`` as it was measured, and the
+                motion before that.
 
         Returns:
-            ``next_from_prev`` and ``next_from_cur``; differentiable in all but the masks' choice of tokens.
+            The camera's motion; differentiable in all but the masks' choice of tokens.
 
         Raises:
             ValueError: an argument of another shape, or a prior missing or not asked for.
@@ -116,15 +142,26 @@ class EgoMotion(nn.Module):
         grid = torch.cat([self.frame(frame) for frame in pair], dim=1)
         tokens = (grid + sinusoidal_positions(grid)).flatten(2).mT
         if prior is not None and self.shown is not None:
-            tokens = tokens + self.shown(torch.cat([_numbers(motion) for motion in prior], dim=1))[:, None]
+            measured = torch.cat([_numbers(motion) for motion in prior[1:]], dim=1)
+            tokens = tokens + self.shown(measured)[:, None]
         looked_at = background_tokens(mask_prev, mask_cur, *grid.shape[-2:])
         for block in self.blocks:
             tokens = block(tokens, looked_at)
         weights = looked_at.to(tokens.dtype) / looked_at.sum(dim=1, keepdim=True)
         mean = (weights[:, None] @ self.norm(tokens))[:, 0]
-        first, second = self.motion(mean).chunk(2, dim=1)
-        from_prev, from_cur = (RigidMotion(seven[:, :4], seven[:, 4:]) for seven in (first, second))
-        return (from_prev, from_cur) if prior is None else (from_prev.after(prior[0]), from_cur.after(prior[1]))
+        said = self.motion(mean)
+        if prior is None or self.swayed is None:
+            first, second = said.chunk(2, dim=1)
+            return CameraMotion(RigidMotion(first[:, :4], first[:, 4:]), RigidMotion(second[:, :4], second[:, 4:]))
+        corrections = (said + self.swayed(measured)).split(_NUMBERS, dim=1)
+        path = [_correction(six).after(prior[0]) for six in corrections]
+        return CameraMotion(path[0].after(prior[1]), path[0], tuple(path[1:]))
+
+
+def _correction(said: torch.Tensor) -> RigidMotion:
+    """[B, 6] -> the motion with the quaternion (1, r / 2) for a small turn r = _TURN_SAID said, and the shift."""
+    turn, shift = _TURN_SAID * said[:, :3], _SHIFT_SAID * said[:, 3:]
+    return RigidMotion(torch.cat([torch.ones_like(turn[:, :1]), turn / 2], dim=1), shift)
 
 
 def _numbers(motion: RigidMotion) -> torch.Tensor:

@@ -22,7 +22,7 @@ from vestcl.models._render import (
     splat_cloud,
 )
 from vestcl.models.config import LOG_DEPTH_FAR, ModelConfig
-from vestcl.models.ego_motion import EgoMotion, RigidMotion
+from vestcl.models.ego_motion import CameraMotion, EgoMotion
 from vestcl.models.encoder import Encoder, upsample_features
 from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
 from vestcl.models.prior import MotionPrior, beside, check_prior
@@ -98,8 +98,8 @@ class Forecaster(nn.Module):
             views: the cameras to show, as (tgt_from_next [B, 4, 4], K [B, 3, 3]), each at its own future time; None
                 is the source camera alone; none at all forecasts motion, with "compose" alone.
             mode: "feedback" takes each forecast frame, as the source camera sees it, for an input of the next step;
-                no gradient passes from step to step. "compose" repeats the motion of the first step, the camera's and
-                in the world what objects have beside it, and encodes nothing anew.
+                no gradient passes from step to step. "compose" encodes nothing anew: the camera goes on as was forecast
+                at t, and repeats its last motion beyond that; things repeat in the world what they did beside it.
             perceive: for "feedback", (image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W])
                 -> layers of that forecast frame; None is `perceive_forecast`.
             prior: motion that was measured, for models that start from it and no others; with "feedback" each later
@@ -121,19 +121,21 @@ class Forecaster(nn.Module):
         prev, cur = self.encode(frame_prev), self.encode(frame_cur)
         motion = self.move(prev, cur, K, prior)
         clouds = self.lift(prev, cur, motion, K) if cameras else []
-        done, shown, future_from_cur = list[Step](), set(range(1, steps + 1) if shown is None else shown), motion.rigid
+        done, shown = list[Step](), set(range(1, steps + 1) if shown is None else shown)
+        future_from_cur, path_from_cur = motion.rigid, motion.path(steps)
         while True:
             step = len(done) + 1
             seen = [self.show(clouds, camera, motion, K) for camera in cameras] if step in shown else []
-            done.append(Step(seen, motion, future_from_cur))
+            done.append(Step(seen, motion, future_from_cur, path_from_cur))
             if step == steps:
                 return done
             if mode == "compose":
+                motion = motion.following()
                 clouds = [advance(cloud, motion.rigid) for cloud in clouds]
             else:
                 looked = straight_view(cameras, seen, straight) if seen else None
                 view = looked or self.show(clouds, straight, motion, K)
-                prior = None if prior is None else next_prior(motion, view, K)
+                prior = None if prior is None else next_prior(prior, motion, view, K)
                 prev, cur = cur, self.encode(perceive_view(view, perceive or perceive_forecast))
                 motion = self.move(prev, cur, K, prior)
                 clouds = self.lift(prev, cur, motion, K)
@@ -208,31 +210,29 @@ class Forecaster(nn.Module):
         to_next = self.move_camera(prev, cur, prior)
         flows = [
             rigid_flow(unproject(frame.layers.depth, K), *rigid)
-            for frame, rigid in zip((prev, cur), to_next, strict=True)
+            for frame, rigid in zip((prev, cur), to_next[:2], strict=True)
         ]
         flow0 = as_image(torch.cat(flows, dim=2), *cur.features.shape[2:])
-        start = flow0 if prior is None or self.object_motion is None else flow0 + beside(prior, to_next)
+        start = flow0 if prior is None or self.object_motion is None else flow0 + beside(prior, to_next[:2])
         return Motion(*to_next, flow0, start, self.move_objects(prev, cur, to_next, flow0, start))
 
-    def move_camera(
-        self, prev: EncodedFrame, cur: EncodedFrame, prior: MotionPrior | None = None
-    ) -> tuple[RigidMotion, RigidMotion]:
-        """EMF on the encoder's grid: ``next_from_prev`` and ``next_from_cur``; rest where the model has none."""
+    def move_camera(self, prev: EncodedFrame, cur: EncodedFrame, prior: MotionPrior | None = None) -> CameraMotion:
+        """EMF on the encoder's grid: the camera's motion; rest where the model has no EMF."""
         if self.ego_motion is None:
-            return rest(cur.features), rest(cur.features)
+            return CameraMotion(rest(cur.features), rest(cur.features))
         frames = prev, cur
         return self.ego_motion(
             *(frame.background_grid for frame in frames),
             *(grid_depth(frame.layers.background_depth) for frame in frames),
             *(grid_mean(frame.layers.mask) for frame in frames),
-            prior=None if prior is None else (prior.next_from_prev, prior.next_from_cur),
+            prior=None if prior is None else (prior.next_from_cur, prior.cur_from_prev, prior.prev_from_before),
         )
 
     def move_objects(
         self,
         prev: EncodedFrame,
         cur: EncodedFrame,
-        to_next: tuple[RigidMotion, RigidMotion],
+        to_next: CameraMotion,
         flow0: torch.Tensor,
         start: torch.Tensor,
     ) -> ObjectMotionForecast:
@@ -247,7 +247,7 @@ class Forecaster(nn.Module):
         frames = prev, cur
         beyond = torch.cat([
             (1 - LOG_DEPTH_FAR / frame.layers.depth).clamp(min=0) * (flow - rigid.translation[:, :, None, None])
-            for frame, rigid, flow in zip(frames, to_next, flow0.split(3, dim=1), strict=True)
+            for frame, rigid, flow in zip(frames, to_next[:2], flow0.split(3, dim=1), strict=True)
         ], dim=1)  # fmt: skip
         objects = self.object_motion(
             *(frame.features for frame in frames),

@@ -1,5 +1,6 @@
 """What was measured of a motion before the networks look: where they start from, and what they correct."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -16,10 +17,12 @@ from vestcl.ops.unproject import unproject
 class MotionPrior(NamedTuple):
     """The motion to the next frame as measurements extrapolate it (SPEC section 8)."""
 
-    next_from_prev: RigidMotion
-    """The camera's, B of them: from t - 1 to t + 1 ..."""
     next_from_cur: RigidMotion
-    """... and from t to t + 1."""
+    """The camera's, B of them, extrapolated."""
+    cur_from_prev: RigidMotion
+    """As measured, from t - 1 to t ..."""
+    prev_from_before: RigidMotion
+    """... and from t - 2 to t - 1; where that is not known, ``cur_from_prev`` once more."""
     velocity_prev: torch.Tensor
     """[B, 3, H, W] m a frame interval, in the camera's axes at t - 1: how what each pixel shows moves in the world; 0
     where it stands still."""
@@ -37,7 +40,7 @@ def check_prior(prior: MotionPrior, like: torch.Tensor) -> None:
     check(
         **{
             f"prior.{name}.{part}": (getattr(getattr(prior, name), part), f"{batch} {size}")
-            for name in ("next_from_prev", "next_from_cur")
+            for name in ("next_from_cur", "cur_from_prev", "prev_from_before")
             for part, size in (("quaternion", 4), ("translation", 3))
         },
         **{
@@ -47,7 +50,7 @@ def check_prior(prior: MotionPrior, like: torch.Tensor) -> None:
     )
 
 
-def beside(prior: MotionPrior, to_next: tuple[RigidMotion, RigidMotion]) -> torch.Tensor:
+def beside(prior: MotionPrior, to_next: Sequence[RigidMotion]) -> torch.Tensor:
     """n R v [B, 6, H, W] m: what the velocities v add to the rigid flow over n = 2 and n = 1 intervals."""
     moved = []
     for velocity, rigid, intervals in zip((prior.velocity_prev, prior.velocity_cur), to_next, (2, 1), strict=True):
@@ -56,14 +59,17 @@ def beside(prior: MotionPrior, to_next: tuple[RigidMotion, RigidMotion]) -> torc
     return torch.cat(moved, dim=1)
 
 
-def repeated(next_from_cur: RigidMotion, moved: torch.Tensor, seen: RenderedView, K: torch.Tensor) -> MotionPrior:
+def repeated(
+    prior: MotionPrior, next_from_cur: RigidMotion, moved: torch.Tensor, seen: RenderedView, K: torch.Tensor
+) -> MotionPrior:
     """The prior of the step after: the camera's motion G once more, and what moved beside it as it did.
 
     What is seen at x came m over the interval, so beside the camera by s = x - G (x - m), if it is foreground. The
     frame before has R^-1 of what its pixels moved beside the rigid flow.
 
     Args:
-        next_from_cur: G of the step that is done.
+        prior: of the step that is done.
+        next_from_cur: G of that step.
         moved: [B, 3, H, W] m, of its current frame's pixels beside the rigid flow, in the next camera's axes.
         seen: its view from the source camera.
         K: [B, 3, 3] px.
@@ -79,4 +85,4 @@ def repeated(next_from_cur: RigidMotion, moved: torch.Tensor, seen: RenderedView
     velocity = as_image(points - before, height, width)
     known = (seen.depth > 0) & (seen.background < FOREGROUND_BELOW)
     velocity_prev = torch.einsum("bji,bjhw->bihw", rigid[:, :3, :3], moved.detach())
-    return MotionPrior(once.after(once), once, velocity_prev, torch.where(known, velocity, 0))
+    return MotionPrior(once, once, prior.cur_from_prev, velocity_prev, torch.where(known, velocity, 0))
