@@ -33,10 +33,10 @@ class NetworkInput(NamedTuple):
 def network_input(prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.float64]]) -> NetworkInput:
     """Two prepared frames with their motion prior: constant velocity, of the camera and of all that moves beside it.
 
-    next_from_cur = constant_velocity(motions) and next_from_prev = next_from_cur cur_from_prev, with the last motion
-    as cur_from_prev. What moves, moves by its own velocity v in the axes of its frame: the networks take it to
-    R (x + n v) + t after n intervals. The recording car's own bonnet does not move in the picture, so there
-    x = R (x + n v) + t, which gives v = (R^-1 (x - t) - x) / n: n = 2 intervals from t - 1, and 1 from t.
+    next_from_cur = constant_velocity(motions), and the last two motions as they are. What moves, moves by its own
+    velocity v in the axes of its frame: the networks take it to R (x + n v) + t after n intervals. The recording car's
+    own bonnet does not move in the picture, so there x = R (x + n v) + t, which gives v = (R^-1 (x - t) - x) / n: n = 2
+    intervals from t - 1, and 1 from t.
 
     Args:
         prev: the frame at t - 1.

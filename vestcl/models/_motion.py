@@ -91,11 +91,5 @@ def arrived(prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, to_next: Mot
         turn = geometry.quaternion_to_matrix(cur_from_prev.quaternion)
         beside = torch.einsum("bij,bjhw->bihw", turn, to_next.velocity_prev)
         flow = flow0 + torch.cat([beside, torch.zeros_like(beside)], dim=1)
-    none = torch.zeros(len(flow), 0, dtype=torch.bool)
-    return Motion(cur_from_prev, rest(cur.features), (), flow0, flow, ObjectMotionForecast(flow, [], none, None))
-
-
-def rest(like: torch.Tensor) -> RigidMotion:
-    """No motion, for each image of ``like`` [B, ...]."""
-    quaternion = like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(like), 1)
-    return RigidMotion(quaternion, like.new_zeros(len(like), 3))
+    objects = ObjectMotionForecast(flow, [], torch.zeros(len(flow), 0, dtype=torch.bool), None)
+    return Motion(cur_from_prev, RigidMotion.rest(cur.features), (), flow0, flow, objects)

@@ -41,6 +41,11 @@ class RigidMotion(NamedTuple):
     translation: torch.Tensor
     """[B, 3] m."""
 
+    @classmethod
+    def rest(cls, like: torch.Tensor) -> "RigidMotion":
+        """No motion, for each image of ``like`` [B, ...]."""
+        return cls(like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(like), 1), like.new_zeros(len(like), 3))
+
     def inverse(self) -> "RigidMotion":
         """x -> R^T (x - t)."""
         quaternion = self.quaternion * self.quaternion.new_tensor([1.0, -1.0, -1.0, -1.0])

@@ -10,7 +10,7 @@ from torch import nn
 from vestcl.models._checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models._clouds import Cloud, advance, as_image, join, lift
 from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame, check_frames, grid_depth, grid_mean, with_depth
-from vestcl.models._motion import INTERVALS, Motion, Step, arrived, next_prior, rest
+from vestcl.models._motion import INTERVALS, Motion, Step, arrived, next_prior
 from vestcl.models._perceive import Perceive, perceive_forecast, perceive_view, straight_view
 from vestcl.models._render import (
     Camera,
@@ -22,7 +22,7 @@ from vestcl.models._render import (
     splat_cloud,
 )
 from vestcl.models.config import LOG_DEPTH_FAR, ModelConfig
-from vestcl.models.ego_motion import CameraMotion, EgoMotion
+from vestcl.models.ego_motion import CameraMotion, EgoMotion, RigidMotion
 from vestcl.models.encoder import Encoder, upsample_features
 from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
 from vestcl.models.prior import MotionPrior, beside, check_prior
@@ -219,7 +219,7 @@ class Forecaster(nn.Module):
     def move_camera(self, prev: EncodedFrame, cur: EncodedFrame, prior: MotionPrior | None = None) -> CameraMotion:
         """EMF on the encoder's grid: the camera's motion; rest where the model has no EMF."""
         if self.ego_motion is None:
-            return CameraMotion(rest(cur.features), rest(cur.features))
+            return CameraMotion(*2 * (RigidMotion.rest(cur.features),))
         frames = prev, cur
         return self.ego_motion(
             *(frame.background_grid for frame in frames),

@@ -30,6 +30,12 @@ class MotionPrior(NamedTuple):
     """The same at t."""
 
 
+def nothing_moves(like: torch.Tensor) -> MotionPrior:
+    """The prior of frames ``like`` [B, C, H, W] in which neither the camera nor a thing was seen to move."""
+    rest, still = RigidMotion.rest(like), like.new_zeros(len(like), 3, *like.shape[2:])
+    return MotionPrior(rest, rest, rest, still, still)
+
+
 def check_prior(prior: MotionPrior, like: torch.Tensor) -> None:
     """Refuse a prior of other frames than ``like`` [B, C, H, W].
 
