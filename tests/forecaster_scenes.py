@@ -42,6 +42,7 @@ def change(**fields: Any) -> ModelConfig:
 #: As vest-s in all but its sizes; TINY is as vest-paper.
 SMALL = change(
     start="prior",
+    ego_motion=EgoMotionConfig(widths=(8, 8, 8, 8), blocks=1, heads=2, path=3),
     render=RenderConfig(rho=0.95, normalised=True),
     refine=dataclasses.replace(TINY.refine, base="filled"),
 )
@@ -93,24 +94,25 @@ def measured(
     height: int,
     width: int,
     *,
-    prev: tuple[float, ...] = (0, 0, 0),
     cur: tuple[float, ...] = (0, 0, 0),
     velocity: tuple[float, ...] = (0, 0, 0),
 ) -> MotionPrior:
-    """The camera's translations to t + 1 and everything's velocity, metres."""
+    """The camera's steady translation and everything's velocity, metres a frame."""
     still = torch.tensor([1.0, 0, 0, 0]).repeat(batch, 1)
-    from_prev, from_cur = (RigidMotion(still, torch.tensor(xyz).float().repeat(batch, 1)) for xyz in (prev, cur))
+    steady = RigidMotion(still, torch.tensor(cur).float().repeat(batch, 1))
     moving = torch.tensor(velocity).float()[:, None, None].repeat(batch, 1, height, width)
-    return MotionPrior(from_prev, from_cur, moving, moving)
+    return MotionPrior(steady, steady, steady, moving, moving)
 
 
 def turning(batch: int, height: int, width: int) -> MotionPrior:
     """A bend over a bump, quaternions of any length, and everything moving its own way."""
-    first = RigidMotion(torch.tensor([[2.0, 0.02, -0.1, 0.03]]), torch.tensor([[0.3, 0.1, -2.0]]))
-    second = RigidMotion(torch.tensor([[-1.0, -0.01, 0.03, 0.01]]), torch.tensor([[0.1, 0.0, -1.0]]))
-    from_prev, from_cur = (RigidMotion(*(part.repeat(batch, 1) for part in rigid)) for rigid in (first, second))
-    velocity_prev, velocity_cur = torch.randn(2, batch, 3, height, width)
-    return MotionPrior(from_prev, from_cur, velocity_prev, velocity_cur)
+    numbers = (
+        ([-1.0, -0.01, 0.03, 0.01], [0.1, 0.0, -1.0]),
+        ([2.0, 0.02, -0.06, 0.01], [0.2, 0.1, -1.1]),
+        ([1.0, 0.0, -0.02, 0.01], [0.2, 0.0, -1.2]),
+    )
+    motions = (RigidMotion(torch.tensor([q]).repeat(batch, 1), torch.tensor([t]).repeat(batch, 1)) for q, t in numbers)
+    return MotionPrior(*motions, *torch.randn(2, batch, 3, height, width))
 
 
 def camera(batch: int, height: int, width: int) -> torch.Tensor:
@@ -119,7 +121,7 @@ def camera(batch: int, height: int, width: int) -> torch.Tensor:
 
 def drive(model: Forecaster, prev: tuple[float, ...], cur: tuple[float, ...]) -> Forecaster:
     """Let the model forecast these translations, metres, whatever it sees."""
-    assert isinstance(model.ego_motion, EgoMotion)
+    assert isinstance(model.ego_motion, EgoMotion) and model.ego_motion.swayed is None
     rest = (1.0, 0.0, 0.0, 0.0)
     with torch.no_grad():
         model.ego_motion.motion.bias.copy_(torch.tensor([*rest, *prev, *rest, *cur]))
@@ -129,10 +131,22 @@ def drive(model: Forecaster, prev: tuple[float, ...], cur: tuple[float, ...]) ->
 def stir(model: Forecaster) -> Forecaster:
     """Last layers that start at zero no longer do: a small motion, other for each object."""
     assert isinstance(model.ego_motion, EgoMotion) and isinstance(model.object_motion, ObjectMotion)
-    nn.init.normal_(model.ego_motion.motion.weight, std=0.01)
+    if model.ego_motion.swayed is None:
+        nn.init.normal_(model.ego_motion.motion.weight, std=0.01)
+    else:  # its answers are scaled to centimetres and hundredths of a radian
+        nn.init.normal_(model.ego_motion.motion.weight, std=0.1)
+        nn.init.normal_(model.ego_motion.swayed.weight, std=0.02)
     for block in model.object_motion.blocks:
         for parameter in block.get_submodule("out").parameters():
             nn.init.normal_(parameter, std=0.01)
+    return model
+
+
+def correct(model: Forecaster, *said: list[float]) -> Forecaster:
+    """Let the model correct each interval of its path by that, turn and shift as the network says them."""
+    assert isinstance(model.ego_motion, EgoMotion)
+    with torch.no_grad():
+        model.ego_motion.motion.bias.copy_(torch.tensor(said).flatten())
     return model
 
 

@@ -1,4 +1,4 @@
-"""vestcl.models.ego_motion: its size, rest at the start, positions and masks."""
+"""vestcl.models.ego_motion: its size, where it starts, the path, positions and masks."""
 
 import math
 from typing import Any
@@ -10,9 +10,14 @@ from tolerances import assert_close
 from vestcl import geometry
 from vestcl.models import EgoMotion, RigidMotion, configuration
 from vestcl.models.config import EgoMotionConfig
-from vestcl.models.ego_motion import background_tokens, sinusoidal_positions
+from vestcl.models.ego_motion import CameraMotion, background_tokens, sinusoidal_positions
 
 SMALL = EgoMotionConfig(widths=(8, 8, 12, 16), heads=2, mlp_ratio=2)
+
+#: The same, with three intervals at once.
+PATH = EgoMotionConfig(widths=(8, 8, 12, 16), heads=2, mlp_ratio=2, path=3)
+
+Prior = tuple[RigidMotion, RigidMotion, RigidMotion]
 
 
 def scene(batch: int, height: int, width: int, features: int = 4, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
@@ -34,9 +39,21 @@ def moving(dtype: torch.dtype = torch.float32) -> EgoMotion:
     return network
 
 
-def numbers(network: EgoMotion, arguments: dict[str, torch.Tensor]) -> torch.Tensor:
-    """[B, 14]."""
-    return torch.cat([part for motion in network(**arguments) for part in motion], dim=1)
+def numbers(network: EgoMotion, arguments: dict[str, Any]) -> torch.Tensor:
+    """[B, 7 motions]: from t - 1, and of each interval."""
+    answer = network(**arguments)
+    return torch.cat([part for motion in (*answer[:2], *answer.later) for part in motion], dim=1)
+
+
+def random_prior(batch: int = 2) -> Prior:
+    """Motions of any size and length of quaternion."""
+    first, second, third = (RigidMotion(torch.randn(batch, 4), torch.randn(batch, 3)) for _ in range(3))
+    return first, second, third
+
+
+def intervals(answer: CameraMotion) -> list[torch.Tensor]:
+    """[B, 4, 4] of each interval ahead."""
+    return [geometry.compose_rigid(*motion) for motion in (answer.next_from_cur, *answer.later)]
 
 
 def test_number_of_parameters() -> None:
@@ -45,19 +62,74 @@ def test_number_of_parameters() -> None:
 
 @pytest.mark.parametrize("name", ["vest-paper", "vest-s"])
 def test_named_models_start_at_rest(name: str) -> None:
-    config = configuration(name)
-    network = EgoMotion(config.ego_motion, config.encoder.features)
-    for quaternion, translation in network(**scene(2, 16, 24, config.encoder.features)):
+    config = configuration(f"{name}+from-rest")
+    network = EgoMotion(config.ego_motion, config.encoder.features, config.start)
+    *to_next, later = network(**scene(2, 16, 24, config.encoder.features))
+    assert not later
+    for quaternion, translation in to_next:
         assert quaternion.tolist() == [[1, 0, 0, 0]] * 2 and translation.tolist() == [[0, 0, 0]] * 2
 
 
 def test_named_models_start_at_the_prior() -> None:
-    """vest-s answers what it is given: exactly, for any length and sign of the quaternion."""
+    """vest-s answers what it is given for all five intervals: exactly, for any length and sign of the quaternion."""
     config = configuration("vest-s")
-    network = EgoMotion(config.ego_motion, config.encoder.features, config.start)
-    prior = tuple(RigidMotion(torch.randn(2, 4), torch.randn(2, 3)) for _ in range(2))
-    for got, wanted in zip(network(**scene(2, 16, 24, config.encoder.features), prior=prior), prior, strict=True):
-        assert torch.equal(got.quaternion, wanted.quaternion) and torch.equal(got.translation, wanted.translation)
+    network, prior = EgoMotion(config.ego_motion, config.encoder.features, config.start), random_prior()
+    answer = network(**scene(2, 16, 24, config.encoder.features), prior=prior)
+    assert len(answer.later) == 4
+    for got in (answer.next_from_cur, *answer.later):
+        assert torch.equal(got.quaternion, prior[0].quaternion) and torch.equal(got.translation, prior[0].translation)
+    from_prev = prior[0].after(prior[1])
+    assert all(torch.equal(got, wanted) for got, wanted in zip(answer.next_from_prev, from_prev, strict=True))
+
+
+def test_a_path_by_hand() -> None:
+    """Each interval is corrected on its own, after the prior: what is said is times 0.03 rad and 0.1 m."""
+    network, prior = EgoMotion(PATH, 4, "prior"), random_prior(1)
+    said = torch.tensor([[1.0, 0, 0, 0, 0, 0], [0, -2, 0, 0, 0, 3], [0, 0, 0, 5, -4, 0]])
+    with torch.no_grad():
+        network.motion.bias.copy_(said.flatten())
+    answer = network(**scene(1, 16, 24), prior=prior)
+    turns = torch.tensor([[1.0, 0.015, 0, 0], [1, 0, -0.03, 0], [1, 0, 0, 0]])  # half the angle
+    shifts = torch.tensor([[0.0, 0, 0], [0, 0, 0.3], [0.5, -0.4, 0]])
+    before = geometry.compose_rigid(*prior[0])
+    got = intervals(answer)
+    for one, correction in zip(got, geometry.compose_rigid(turns, shifts), strict=True):
+        assert_close(one[0], correction @ before[0])
+    assert_close(geometry.compose_rigid(*answer.next_from_prev), got[0] @ geometry.compose_rigid(*prior[1]))
+    angle = torch.linalg.matrix_norm(got[0] @ geometry.invert(before) - torch.eye(4)) / 2**0.5  # of a small turn
+    assert float(angle) == pytest.approx(0.03, rel=1e-3)
+
+
+def test_how_the_camera_swayed_counts_in_a_line() -> None:
+    """With the last layer at 0, only the motions' numbers: 100 v of a small turn and the translation, of either."""
+    network, sizes = EgoMotion(PATH, 4, "prior"), torch.tensor([1.0, -2.0])[:, None]
+    assert network.swayed is not None
+    weight = torch.zeros(3, 6, 2, 6)
+    weight[0, 1, 0, 1] = 0.5  # the first interval's turn about y, from the last motion's
+    weight[2, 5, 1, 3] = 2.0  # the third one's z, from the x of the motion before
+    with torch.no_grad():
+        network.swayed.weight.copy_(weight.flatten(0, 1).flatten(1))
+    still, none = torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1), torch.zeros(2, 3)
+    turning = RigidMotion(-3 * (still + sizes * torch.tensor([[0.0, 0, 0.001, 0]])), none)
+    sliding = RigidMotion(still, sizes * torch.tensor([[0.25, 0, 0]]))
+    first, second, third = intervals(network(**scene(2, 16, 24), prior=(RigidMotion(still, none), turning, sliding)))
+    angle = 0.002 * sizes[:, 0]  # twice the half, and of that said 100 * 0.5 * 0.03
+    assert torch.allclose(first[:, 0, 2], 100 * 0.5 * 0.03 * angle, rtol=1e-3)
+    assert torch.equal(second, torch.eye(4).repeat(2, 1, 1))
+    assert torch.allclose(third[:, :3, 3], 0.1 * 2.0 * 0.25 * sizes * torch.tensor([[0.0, 0, 1]]))
+
+
+def test_adams_first_step_is_a_small_motion() -> None:
+    """It moves each weight of the last layers by the learning rate, whatever the loss: millimetres and milliradians."""
+    network, arguments, prior = EgoMotion(PATH, 4, "prior"), scene(2, 16, 24), random_prior()
+    prior = (prior[0], *(RigidMotion(torch.tensor([[1.0, 0, 0.01, 0]] * 2), torch.ones(2, 3)) for _ in range(2)))
+    adam = torch.optim.Adam(network.parameters(), lr=1e-3)
+    before = intervals(network(**arguments, prior=prior))
+    torch.stack([(motion * torch.randn(2, 4, 4)).sum() for motion in before]).sum().backward()
+    adam.step()
+    assert network.swayed is not None and network.swayed.weight.any() and network.motion.weight.any()
+    for one, other in zip(before, intervals(network(**arguments, prior=prior)), strict=True):
+        assert 0 < float((other @ geometry.invert(one) - torch.eye(4)).abs().max()) < 0.01
 
 
 def test_one_motion_after_another() -> None:
@@ -68,11 +140,11 @@ def test_one_motion_after_another() -> None:
 
 
 def test_the_prior_has_a_gradient_and_every_tensor() -> None:
-    network = EgoMotion(SMALL, 4, "prior").double()
+    network = EgoMotion(PATH, 4, "prior").double()
     torch.nn.init.normal_(network.motion.weight)
-    prior = tuple(RigidMotion(*(torch.randn(2, n).double().requires_grad_() for n in (4, 3))) for _ in range(2))
-    output = torch.cat([part for motion in network(**scene(2, 16, 24, dtype=torch.float64), prior=prior)
-                        for part in motion], dim=1)  # fmt: skip
+    prior = [RigidMotion(*(part.double().requires_grad_() for part in motion)) for motion in random_prior()]
+    output = numbers(network, {**scene(2, 16, 24, dtype=torch.float64), "prior": tuple(prior)})
+    assert output.shape == (2, 7 * 4)
     (output * torch.randn_like(output)).sum().backward()
     given = [(f"prior {i}", part) for i, motion in enumerate(prior) for part in motion]
     for name, tensor in [*given, *network.named_parameters()]:
@@ -82,14 +154,15 @@ def test_the_prior_has_a_gradient_and_every_tensor() -> None:
 @pytest.mark.parametrize("start", ["rest", "prior"])
 def test_a_prior_where_it_is_wanted(start: str) -> None:
     rest = RigidMotion(torch.tensor([[1.0, 0, 0, 0]] * 2), torch.zeros(2, 3))
-    prior = (rest, rest) if start == "rest" else None
+    prior = (rest, rest, rest) if start == "rest" else None
     with pytest.raises(ValueError, match=f"`prior` must be {'none' if start == 'rest' else 'given'}"):
         EgoMotion(SMALL, 4, start)(**scene(2, 8, 9), prior=prior)
 
 
 @pytest.mark.parametrize(("height", "width"), [(16, 24), (17, 23), (5, 2), (1, 1)])
 def test_any_size(height: int, width: int) -> None:
-    next_from_prev, next_from_cur = moving()(**scene(2, height, width))
+    next_from_prev, next_from_cur, later = moving()(**scene(2, height, width))
+    assert not later
     for quaternion, translation in (next_from_prev, next_from_cur):
         assert quaternion.shape == (2, 4) and translation.shape == (2, 3)
         assert quaternion.isfinite().all() and translation.isfinite().all()

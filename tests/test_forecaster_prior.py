@@ -10,6 +10,7 @@ from forecaster_scenes import (
     SMALL,
     TINY,
     camera,
+    correct,
     measured,
     pair_of,
     plain,
@@ -20,7 +21,7 @@ from forecaster_scenes import (
 )
 
 from vestcl import geometry
-from vestcl.models import EgoMotion, RigidMotion
+from vestcl.models import RigidMotion
 from vestcl.models.forecaster import Forecaster, Step
 from vestcl.models.prior import MotionPrior
 from vestcl.ops.unproject import unproject
@@ -33,7 +34,7 @@ def test_untrained_it_forecasts_the_prior() -> None:
     """x -> R (x + n v) + t, with n = 2 intervals from t - 1 and one from t."""
     pair, K, prior = pair_of(2, 32, 48), camera(2, 32, 48), turning(2, 32, 48)
     motion = Forecaster(SMALL)(*pair, K, prior=prior).motion
-    rigids = prior.next_from_prev, prior.next_from_cur
+    rigids = prior.next_from_cur.after(prior.cur_from_prev), prior.next_from_cur
     velocities = prior.velocity_prev, prior.velocity_cur
     for side in range(2):
         points = unproject(pair[side].depth, K)
@@ -62,20 +63,19 @@ def test_without_object_motion_things_stand() -> None:
 
 def test_the_camera_is_corrected_after_the_prior() -> None:
     """The network's motion is made in the axes that the prior leads to."""
-    model, prior = Forecaster(SMALL), turning(1, 32, 48)
-    assert isinstance(model.ego_motion, EgoMotion)
-    correction = torch.tensor([1.0, 0.0, 0.1, 0.0, 0.5, 0.0, 0.2])
-    with torch.no_grad():
-        model.ego_motion.motion.bias.copy_(torch.cat([torch.tensor([1.0, 0, 0, 0, 0, 0, 0]), correction]))
-    motion = model(*pair_of(1, 32, 48), camera(1, 32, 48), prior=prior).motion
-    after = geometry.compose_rigid(correction[None, :4], correction[None, 4:])
-    assert torch.allclose(motion.rigid, after @ geometry.compose_rigid(*prior.next_from_cur), atol=1e-5)
-    before = geometry.compose_rigid(*prior.next_from_prev)
-    assert torch.allclose(geometry.compose_rigid(*motion.next_from_prev), before, atol=1e-6)
+    model, prior, still = Forecaster(SMALL), turning(1, 32, 48), [0.0] * 6
+    motion = correct(model, [0, 2.0, 0, 5, 0, 2], still, still)(*pair_of(1, 32, 48), camera(1, 32, 48), prior=prior).motion
+    correction = RigidMotion(torch.tensor([[1.0, 0, 0.03, 0]]), torch.tensor([[0.5, 0, 0.2]]))
+    wanted = geometry.compose_rigid(*correction) @ geometry.compose_rigid(*prior.next_from_cur)
+    assert torch.allclose(motion.rigid, wanted, atol=1e-5)
+    from_prev = wanted @ geometry.compose_rigid(*prior.cur_from_prev)
+    assert torch.allclose(geometry.compose_rigid(*motion.next_from_prev), from_prev, atol=1e-5)
+    for later in motion.later:
+        assert torch.equal(geometry.compose_rigid(*later), geometry.compose_rigid(*prior.next_from_cur))
 
 
 def test_the_network_is_shown_the_prior() -> None:
-    """A turn counts by its rotation, not by its quaternion's length or sign."""
+    """The last two motions; a turn counts by its rotation, not by its quaternion's length or sign."""
     model = stir(Forecaster(SMALL))
     prev, cur = (model.encode(one) for one in pair_of(1, 32, 48))
 
@@ -84,10 +84,12 @@ def test_the_network_is_shown_the_prior() -> None:
         return moved @ geometry.invert(geometry.compose_rigid(*prior.next_from_cur))
 
     prior = turning(1, 32, 48)
-    same = prior._replace(next_from_cur=prior.next_from_cur._replace(quaternion=-3 * prior.next_from_cur.quaternion))
-    faster = prior._replace(next_from_cur=prior.next_from_cur._replace(translation=2 * prior.next_from_cur.translation))
-    assert torch.allclose(correction(same), correction(prior), atol=1e-5)
-    assert not torch.allclose(correction(faster), correction(prior), atol=1e-4)
+    for name in ("cur_from_prev", "prev_from_before"):
+        motion = getattr(prior, name)
+        same = prior._replace(**{name: motion._replace(quaternion=-3 * motion.quaternion)})
+        faster = prior._replace(**{name: motion._replace(translation=2 * motion.translation)})
+        assert torch.allclose(correction(same), correction(prior), atol=1e-5), name
+        assert not torch.allclose(correction(faster), correction(prior), atol=1e-4), name
 
 
 def test_a_prior_is_given_where_it_is_wanted() -> None:
@@ -99,9 +101,10 @@ def test_a_prior_is_given_where_it_is_wanted() -> None:
     short = prior._replace(velocity_cur=torch.zeros(2, 3, 32, 40))
     with pytest.raises(ValueError, match=r"`prior.velocity_cur` must be \[2, 3, 32, 48\], got \[2, 3, 32, 40\]"):
         Forecaster(SMALL)(*pair, K, prior=short)
-    one = prior._replace(next_from_prev=RigidMotion(torch.ones(1, 4), torch.zeros(2, 3)))
-    with pytest.raises(ValueError, match=r"`prior.next_from_prev.quaternion` must be \[2, 4\], got \[1, 4\]"):
-        Forecaster(SMALL)(*pair, K, prior=one)
+    for name in ("next_from_cur", "cur_from_prev", "prev_from_before"):
+        one = prior._replace(**{name: RigidMotion(torch.ones(1, 4), torch.zeros(2, 3))})
+        with pytest.raises(ValueError, match=rf"`prior.{name}.quaternion` must be \[2, 4\], got \[1, 4\]"):
+            Forecaster(SMALL)(*pair, K, prior=one)
 
 
 # ---------------------------------------------------------------- further on
@@ -115,7 +118,7 @@ def before_a_wall(layers: LayerBatch, behind: float) -> LayerBatch:
 @pytest.mark.parametrize("mode", ["feedback", "compose"])
 def test_what_moves_once_moves_on(mode: Any) -> None:
     """The camera goes 1 m a frame to the left before something at 10 m that goes 0.5 m to the right: 4.5 px a frame."""
-    prior = measured(1, 32, 64, prev=(2, 0, 0), cur=(1, 0, 0), velocity=(0.5, 0, 0))
+    prior = measured(1, 32, 64, cur=(1, 0, 0), velocity=(0.5, 0, 0))
     model, scene = Forecaster(PAINTING).eval(), before_a_wall(wall(32, 64, 10.0), 10)
 
     def perceive(*seen: torch.Tensor) -> LayerBatch:
@@ -133,7 +136,7 @@ def test_feedback_goes_on_as_composed_while_the_camera_turns() -> None:
     """What is seen at t + 2 and t + 3 is where constant velocity in the world takes it, in both modes."""
     turn = RigidMotion(torch.tensor([[1.0, 0, 0.01, 0]]), torch.tensor([[0.0, 0, -0.5]]))
     velocity = torch.tensor([0.2, 0.0, -0.1])[:, None, None].expand(1, 3, 32, 64)
-    prior = MotionPrior(turn.after(turn), turn, velocity, velocity)
+    prior = MotionPrior(turn, turn, turn, velocity, velocity)
     model, scene = Forecaster(PAINTING).eval(), before_a_wall(wall(32, 64, 10.0), 1.02)
 
     def run(mode: Any) -> list[Step]:
@@ -166,4 +169,5 @@ def test_the_world_stands_still_in_feedback() -> None:
     moving = later.velocity_cur.abs().amax(dim=1) > 0
     assert 0 < moving.float().mean() < 0.1  # the block of foreground
     assert torch.allclose(later.velocity_prev, torch.tensor(0.3), atol=1e-4)
-    assert torch.allclose(later.next_from_prev.translation, torch.tensor([[0.0, 0, -2]]), atol=1e-5)
+    for motion in later[:3]:  # forecast once and measured twice, all the same
+        assert torch.allclose(motion.translation, torch.tensor([[0.0, 0, -1]]), atol=1e-5)

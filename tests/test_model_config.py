@@ -51,8 +51,24 @@ def test_every_variant_changes_its_own_field() -> None:
             different = {
                 f.name for f in dataclasses.fields(config) if getattr(config, f.name) != getattr(CONFIGS[base], f.name)
             }
-            both = variant in ("features-only", "residual", "filled", "painting")  # what is rendered, what is added to
-            assert different <= {"name", "render", "refine"} if both else len(different) <= 2
+            if variant == "from-rest":  # and no further than the next frame
+                assert different <= {"name", "start", "ego_motion"}
+            elif variant in ("features-only", "residual", "filled", "painting"):  # what is rendered, what is added to
+                assert different <= {"name", "render", "refine"}
+            else:
+                assert len(different) <= 2
+
+
+def test_a_path_needs_a_prior() -> None:
+    """The variant from rest forecasts the next frame alone; from its prior vest-s forecasts five."""
+    paths = {}
+    for name in ("vest-paper", "vest-s", "vest-s+from-rest", "vest-s+from-prior", "vest-paper+from-prior"):
+        ego_motion = configuration(name).ego_motion
+        paths[name] = ego_motion and ego_motion.path
+    assert paths == {
+        "vest-paper": 1, "vest-s": 5, "vest-s+from-rest": 1, "vest-s+from-prior": 5, "vest-paper+from-prior": 1,
+    }  # fmt: skip
+    assert configuration("vest-s+no-emf+from-rest").ego_motion is None
 
 
 def test_variants_add_up() -> None:
@@ -69,7 +85,11 @@ def test_the_parts_of_a_model_fit(name: str) -> None:
     channels, depth, mask = config.encoder.features, torch.rand(1, 1, 4, 8) * 50, torch.ones(1, 1, 4, 8)
     assert features.shape[1] == channels
     if config.ego_motion:
-        EgoMotion(config.ego_motion, channels)(features, features, depth, depth, mask, mask)
+        rest = RigidMotion(torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3))
+        prior = None if config.start == "rest" else (rest, rest, rest)
+        network = EgoMotion(config.ego_motion, channels, config.start)
+        motion = network(features, features, depth, depth, mask, mask, prior)
+        assert len(motion.later) == config.ego_motion.path - 1
     if config.object_motion:
         network = ObjectMotion(config.object_motion, channels)
         assert network(features, features, depth, depth, mask, mask, torch.rand(1, 6, 4, 8)).flow.shape == (1, 6, 4, 8)
@@ -93,6 +113,11 @@ def test_frozen_and_hashable() -> None:
         (lambda: configuration("vest-s+no-omf+routing"), "'vest-s' has no object motion to change"),
         (lambda: configuration("vest-s+features-only+residual"), r"needs `render.colour`"),
         (lambda: EgoMotionConfig(heads=3), r"`widths\[-1\]` must be a multiple of 4 `heads` = 12, got 256"),
+        (lambda: EgoMotionConfig(path=0), "`path` must be 1 or more, got 0"),
+        (
+            lambda: ModelConfig("mine", ego_motion=EgoMotionConfig(path=2)),
+            '`ego_motion.path` must be 1 with `start` "rest", got 2',
+        ),
         (lambda: ObjectMotionConfig(shape="vgg"), '`shape` must be "paper" or "dmvfn", got \'vgg\''),  # type: ignore[arg-type]
         (lambda: ObjectMotionConfig(scales=(4, 2)), r"`scales` and `widths` must be as long, got \(4, 2\)"),
         (lambda: ObjectMotionConfig(scales=(), widths=()), "`scales` and `widths` must be as long"),

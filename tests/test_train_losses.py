@@ -37,9 +37,10 @@ def batch_of(target: torch.Tensor, future_from_cur: torch.Tensor, known: list[bo
     prev, cur = pair_of(size, *target.shape[2:])
     K, eye = camera(size, *target.shape[2:]), torch.eye(4).repeat(size, 1, 1)
     rest = RigidMotion(torch.tensor([[1.0, 0, 0, 0]]).repeat(size, 1), torch.zeros(size, 3))
-    still = MotionPrior(rest, rest, torch.zeros_like(target), torch.zeros_like(target))
+    still = MotionPrior(rest, rest, rest, torch.zeros_like(target), torch.zeros_like(target))
     clips = tuple(f"clip/{number}" for number in range(size))
-    return Batch(prev, cur, K, still, 1, target, eye, K, future_from_cur, torch.tensor(known), clips)
+    path_from_cur = future_from_cur[:, None]
+    return Batch(prev, cur, K, still, 1, target, eye, K, future_from_cur, path_from_cur, torch.tensor(known), clips)
 
 
 def forecast(moving: bool = False) -> tuple[Forecaster, RenderedView, Step, Batch]:
@@ -173,7 +174,7 @@ def test_the_sum_is_of_the_weighted_terms() -> None:
 
 def test_the_truth_costs_nothing() -> None:
     _, view, step, batch = forecast()
-    batch = batch._replace(target=view.image.detach(), future_from_cur=step.future_from_cur.detach())
+    batch = batch._replace(target=view.image.detach(), path_from_cur=step.path_from_cur.detach())
     config = settings(l1=1.0, ssim=1.0, pose={"rotation": 1.0, "translation": 1.0}, residual_motion=1.0)
     assert number(total_loss(view, step, batch, config, None)[0]) == pytest.approx(0, abs=1e-5)
 

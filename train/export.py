@@ -1,0 +1,58 @@
+"""A file that ships, of a checkpoint: ``python -m train.export runs/x/checkpoints/step-00001000 vest-s.safetensors``.
+
+Weights are rounded to float16, which halves the file; they are read as float32 again.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+from rich.text import Text
+
+from vestcl.models._checkpoint import write_checkpoint
+from vestcl.pretrained import load_model
+
+
+@dataclass(frozen=True)
+class Export:
+    """Round a model's weights to float16."""
+
+    checkpoint: tyro.conf.Positional[Path]
+    """A training checkpoint's folder, whose running mean is taken, or a model's file."""
+    out: tyro.conf.Positional[Path]
+    """The file to write, *.safetensors."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command; its exit status."""
+    options = tyro.cli(Export, args=arguments, description=__doc__, prog="python -m train.export")
+    try:
+        export(options.checkpoint, options.out)
+    except (ValueError, OSError) as error:
+        Console(stderr=True).print(Text(f"error: {error}", style="red"), soft_wrap=True)
+        return 2
+    return 0
+
+
+def export(checkpoint: Path, out: Path) -> None:
+    """Write ``out``.
+
+    Args:
+        checkpoint: as `vestcl.pretrained.load_model` takes it.
+        out: the file.
+
+    Raises:
+        FileNotFoundError: no such checkpoint.
+        ValueError: a damaged one, or weights beyond what float16 holds.
+    """
+    model = load_model(checkpoint)
+    state = {name: tensor.half() for name, tensor in model.state_dict().items()}
+    if beyond := [name for name, tensor in state.items() if not tensor.isfinite().all()]:
+        raise ValueError(f"`checkpoint` must have weights below 65,504 for float16, got more in {', '.join(beyond)}")
+    write_checkpoint(out, model.config, state)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
