@@ -111,8 +111,10 @@ def turning(batch: int, height: int, width: int) -> MotionPrior:
         ([2.0, 0.02, -0.06, 0.01], [0.2, 0.1, -1.1]),
         ([1.0, 0.0, -0.02, 0.01], [0.2, 0.0, -1.2]),
     )
-    motions = (RigidMotion(torch.tensor([q]).repeat(batch, 1), torch.tensor([t]).repeat(batch, 1)) for q, t in numbers)
-    return MotionPrior(*motions, *torch.randn(2, batch, 3, height, width))
+    ahead, last, before = (
+        RigidMotion(torch.tensor([q]).repeat(batch, 1), torch.tensor([t]).repeat(batch, 1)) for q, t in numbers
+    )
+    return MotionPrior(ahead, last, before, *torch.randn(2, batch, 3, height, width))
 
 
 def camera(batch: int, height: int, width: int) -> torch.Tensor:

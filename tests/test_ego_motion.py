@@ -97,7 +97,7 @@ def test_a_path_by_hand() -> None:
         assert_close(one[0], correction @ before[0])
     assert_close(geometry.compose_rigid(*answer.next_from_prev), got[0] @ geometry.compose_rigid(*prior[1]))
     angle = torch.linalg.matrix_norm(got[0] @ geometry.invert(before) - torch.eye(4)) / 2**0.5  # of a small turn
-    assert float(angle) == pytest.approx(0.03, rel=1e-3)
+    assert angle.item() == pytest.approx(0.03, rel=1e-3)
 
 
 def test_how_the_camera_swayed_counts_in_a_line() -> None:
@@ -121,15 +121,16 @@ def test_how_the_camera_swayed_counts_in_a_line() -> None:
 
 def test_adams_first_step_is_a_small_motion() -> None:
     """It moves each weight of the last layers by the learning rate, whatever the loss: millimetres and milliradians."""
-    network, arguments, prior = EgoMotion(PATH, 4, "prior"), scene(2, 16, 24), random_prior()
-    prior = (prior[0], *(RigidMotion(torch.tensor([[1.0, 0, 0.01, 0]] * 2), torch.ones(2, 3)) for _ in range(2)))
+    network, arguments = EgoMotion(PATH, 4, "prior"), scene(2, 16, 24)
+    driving = RigidMotion(torch.tensor([[1.0, 0, 0.01, 0]] * 2), torch.ones(2, 3))
+    prior = (driving, driving, driving)
     adam = torch.optim.Adam(network.parameters(), lr=1e-3)
     before = intervals(network(**arguments, prior=prior))
     torch.stack([(motion * torch.randn(2, 4, 4)).sum() for motion in before]).sum().backward()
     adam.step()
     assert network.swayed is not None and network.swayed.weight.any() and network.motion.weight.any()
     for one, other in zip(before, intervals(network(**arguments, prior=prior)), strict=True):
-        assert 0 < float((other @ geometry.invert(one) - torch.eye(4)).abs().max()) < 0.01
+        assert 0 < (other @ geometry.invert(one) - torch.eye(4)).abs().max().item() < 0.01
 
 
 def test_one_motion_after_another() -> None:

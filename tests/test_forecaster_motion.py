@@ -7,8 +7,8 @@ from forecaster_scenes import ABLATIONS, FOCAL, SHARP, TINY, camera, drive, fram
 
 from vestcl.models import EgoMotion, ObjectMotion
 from vestcl.models._frames import grid_depth, grid_mean
-from vestcl.models._render import LEAST_COVERAGE, Side, compose_view
-from vestcl.models.config import FIXED_DEPTH, LOG_DEPTH_FAR
+from vestcl.models._render import Side, compose_view
+from vestcl.models.config import FIXED_DEPTH, LEAST_COVERAGE, LOG_DEPTH_FAR
 from vestcl.models.forecaster import Forecaster
 from vestcl.scene.layers import SKY_DEPTH
 

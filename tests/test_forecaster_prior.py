@@ -64,7 +64,9 @@ def test_without_object_motion_things_stand() -> None:
 def test_the_camera_is_corrected_after_the_prior() -> None:
     """The network's motion is made in the axes that the prior leads to."""
     model, prior, still = Forecaster(SMALL), turning(1, 32, 48), [0.0] * 6
-    motion = correct(model, [0, 2.0, 0, 5, 0, 2], still, still)(*pair_of(1, 32, 48), camera(1, 32, 48), prior=prior).motion
+    motion = correct(model, [0, 2.0, 0, 5, 0, 2], still, still)(
+        *pair_of(1, 32, 48), camera(1, 32, 48), prior=prior
+    ).motion
     correction = RigidMotion(torch.tensor([[1.0, 0, 0.03, 0]]), torch.tensor([[0.5, 0, 0.2]]))
     wanted = geometry.compose_rigid(*correction) @ geometry.compose_rigid(*prior.next_from_cur)
     assert torch.allclose(motion.rigid, wanted, atol=1e-5)
@@ -102,7 +104,8 @@ def test_a_prior_is_given_where_it_is_wanted() -> None:
     with pytest.raises(ValueError, match=r"`prior.velocity_cur` must be \[2, 3, 32, 48\], got \[2, 3, 32, 40\]"):
         Forecaster(SMALL)(*pair, K, prior=short)
     for name in ("next_from_cur", "cur_from_prev", "prev_from_before"):
-        one = prior._replace(**{name: RigidMotion(torch.ones(1, 4), torch.zeros(2, 3))})
+        change: dict[str, Any] = {name: RigidMotion(torch.ones(1, 4), torch.zeros(2, 3))}
+        one = prior._replace(**change)
         with pytest.raises(ValueError, match=rf"`prior.{name}.quaternion` must be \[2, 4\], got \[1, 4\]"):
             Forecaster(SMALL)(*pair, K, prior=one)
 

@@ -7,7 +7,17 @@ from typing import Any
 import pytest
 import torch
 
-from vestcl.models import CONFIGS, VARIANTS, EgoMotion, Encoder, ModelConfig, ObjectMotion, Refine, configuration
+from vestcl.models import (
+    CONFIGS,
+    VARIANTS,
+    EgoMotion,
+    Encoder,
+    ModelConfig,
+    ObjectMotion,
+    Refine,
+    RigidMotion,
+    configuration,
+)
 from vestcl.models.config import EgoMotionConfig, ObjectMotionConfig, RefineConfig, RenderConfig, RoutingConfig
 
 
@@ -39,9 +49,9 @@ def test_every_variant_changes_its_own_field() -> None:
         "painting": lambda c: c.refine.base == "none" and not c.render.normalised,
         "from-rest": lambda c: c.start == "rest",
         "from-prior": lambda c: c.start == "prior",
-        "omf-paper": lambda c: c.object_motion.shape == "paper",
-        "omf-dmvfn": lambda c: c.object_motion.shape == "dmvfn",
-        "routing": lambda c: c.object_motion.routing == RoutingConfig(budget=4.5),
+        "omf-paper": lambda c: c.object_motion is not None and c.object_motion.shape == "paper",
+        "omf-dmvfn": lambda c: c.object_motion is not None and c.object_motion.shape == "dmvfn",
+        "routing": lambda c: c.object_motion is not None and c.object_motion.routing == RoutingConfig(budget=4.5),
     }
     assert set(changed) == set(VARIANTS)
     for base in CONFIGS:
@@ -87,8 +97,8 @@ def test_the_parts_of_a_model_fit(name: str) -> None:
     if config.ego_motion:
         rest = RigidMotion(torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3))
         prior = None if config.start == "rest" else (rest, rest, rest)
-        network = EgoMotion(config.ego_motion, channels, config.start)
-        motion = network(features, features, depth, depth, mask, mask, prior)
+        camera = EgoMotion(config.ego_motion, channels, config.start)
+        motion = camera(features, features, depth, depth, mask, mask, prior)
         assert len(motion.later) == config.ego_motion.path - 1
     if config.object_motion:
         network = ObjectMotion(config.object_motion, channels)

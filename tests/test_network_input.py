@@ -76,12 +76,15 @@ def test_input_has_memory_of_its_own() -> None:
     assert np.array_equal(cur.velocity, kept) and cur.layers.image.any()
 
 
-def test_motion_from_the_previous_frame_goes_through_the_current_one() -> None:
+def test_the_last_two_motions_are_told() -> None:
     prev, cur = prepared(0, MOTIONS[0]), prepared(1, MOTIONS[1])
     prior = network_input(prev, cur, last_motions(prev, cur)).prior
-    from_prev, from_cur = (geometry.compose_rigid(*rigid)[0].double() for rigid in prior[:2])
-    torch.testing.assert_close(from_prev, from_cur @ torch.from_numpy(MOTIONS[1]), rtol=0, atol=1e-6)
-    assert float(from_cur[2, 3]) == pytest.approx((MOTIONS[0][2, 3] + MOTIONS[1][2, 3]) / 2)
+    from_cur, last, before = (geometry.compose_rigid(*rigid)[0].double().numpy() for rigid in prior[:3])
+    np.testing.assert_allclose(last, MOTIONS[1], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(before, MOTIONS[0], rtol=0, atol=1e-6)
+    assert from_cur[2, 3] == pytest.approx((MOTIONS[0][2, 3] + MOTIONS[1][2, 3]) / 2)
+    prior = network_input(prepared(0, None), cur, MOTIONS[1:]).prior  # of a clip's first two frames
+    assert all(torch.equal(one, other) for one, other in zip(prior[1], prior[2], strict=True))
 
 
 def test_prior_is_the_geometric_forecasts_motion() -> None:
@@ -97,7 +100,7 @@ def test_recording_car_rides_along_and_nothing_else_does() -> None:
     prev, cur = prepared(0, MOTIONS[0], own=True), prepared(1, MOTIONS[1], own=True)
     prior = network_input(prev, cur, last_motions(prev, cur)).prior
     for frame, rigid, velocity, intervals in (
-        (prev, prior.next_from_prev, prior.velocity_prev, 2),
+        (prev, prior.next_from_cur.after(prior.cur_from_prev), prior.velocity_prev, 2),
         (cur, prior.next_from_cur, prior.velocity_cur, 1),
     ):
         own = torch.from_numpy(frame.own.ravel())

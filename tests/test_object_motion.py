@@ -36,7 +36,7 @@ def moving(config: ObjectMotionConfig) -> ObjectMotion:
     """A network whose blocks no longer end in zero."""
     network = ObjectMotion(config, FEATURES)
     for block in network.blocks:
-        assert isinstance(block, MotionBlock)
+        assert isinstance(block, MotionBlock) and block.out.bias is not None
         nn.init.normal_(block.out.weight, std=0.1)
         nn.init.normal_(block.out.bias, std=0.1)
     return network
@@ -134,6 +134,7 @@ def test_a_block_as_it_is_written(scale: int) -> None:
     c = conv(conv(a, block.shrunk_in).relu(), block.down[0]).relu()
     inner = c
     for layer in block.inner:
+        assert isinstance(layer, nn.Sequential)
         inner = conv(inner, layer[0]).relu()
     a = conv(c + inner, block.squeeze[0]).relu()
     a = functional.interpolate(a, scale_factor=scale, mode="bilinear") if scale > 1 else a

@@ -5,6 +5,7 @@ import dataclasses
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -128,9 +129,14 @@ def test_pocl_without_a_linker_names_the_remedy(monkeypatch: pytest.MonkeyPatch,
 
 
 def test_a_program_is_built_once(kernels: Path, fresh: runtime.Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    builds = []
+    builds: list[Any] = []
     build = fresh._build
-    monkeypatch.setattr(fresh, "_build", lambda *arguments: builds.append(arguments) or build(*arguments))
+
+    def counted(*arguments: Any) -> Any:
+        builds.append(arguments)
+        return build(*arguments)
+
+    monkeypatch.setattr(fresh, "_build", counted)
     defines = runtime.defines_for(np.dtype(np.float32))
     first = fresh.kernel("scale.cl", "scale", defines)
     assert fresh.kernel("scale.cl", "scale", dict(reversed(defines.items()))) is first
@@ -195,7 +201,7 @@ def test_a_cpu_reads_the_array_itself(kernels: Path, fresh: runtime.Session) -> 
         pytest.skip("this device has a memory of its own")
     array, result = np.ones(8, np.float32), np.empty(8, np.float32)
     with fresh.job() as job:
-        arguments = [np.float32(2), job.read(array), job.write(result)]
+        arguments: list[Any] = [np.float32(2), job.read(array), job.write(result)]
         array[:] = 21  # after `read`: a copy would not see it
         job.launch("scale.cl", "scale", runtime.defines_for(array.dtype), array.shape, arguments)
     assert result.tolist() == [42] * 8

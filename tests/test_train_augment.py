@@ -14,6 +14,8 @@ from test_network_input import HEIGHT, MOTIONS, WIDTH, prepared
 from train import augment
 from train.augment import Window
 from vestcl import geometry, reference
+from vestcl.models import EgoMotion, RigidMotion
+from vestcl.models.config import EgoMotionConfig
 from vestcl.network_input import last_motions, network_input
 from vestcl.scene.ego_motion import constant_velocity
 
@@ -41,7 +43,8 @@ def window() -> Window:
     """Two random frames, the bonnet in both, and a target from beside."""
     target = np.random.default_rng(9).random((3, HEIGHT, WIDTH), np.float32)
     prev, cur = prepared(0, MOTIONS[0], own=True), prepared(1, MOTIONS[1], own=True)
-    return Window(prev, cur, target, TARGET_K, TGT_FROM_NEXT, MOTIONS[0] @ MOTIONS[1])
+    path = MOTIONS[1], MOTIONS[0] @ MOTIONS[1]
+    return Window(prev, cur, target, TARGET_K, TGT_FROM_NEXT, path[1], path)
 
 
 def shown_at(window: Window, xyz: NDArray[Any], velocity: NDArray[Any]) -> NDArray[np.float64]:
@@ -71,6 +74,9 @@ def test_true_motion_changes_as_the_cameras_do(window: Window, name: str) -> Non
     assert window.future_from_cur is not None and changed.future_from_cur is not None
     composed = np.linalg.multi_dot(last_motions(changed.prev, changed.cur))
     np.testing.assert_allclose(changed.future_from_cur, composed, rtol=0, atol=1e-12)
+    first, second = changed.path_from_cur
+    assert np.array_equal(second, changed.future_from_cur)
+    np.testing.assert_allclose(first, last_motions(changed.cur)[0], rtol=0, atol=1e-12)
 
 
 def test_planes_are_cut_and_mirrored_alike(window: Window) -> None:
@@ -93,12 +99,33 @@ def test_mirrored_motions_have_the_quaternions_of_a_mirror(window: Window) -> No
         network_input(each.prev, each.cur, last_motions(each.prev, each.cur)).prior
         for each in (window, augment.flip(window))
     )
-    for before, after in zip(prior[:2], mirrored[:2], strict=True):
+    for before, after in zip(prior[:3], mirrored[:3], strict=True):
         torch.testing.assert_close(after.quaternion, before.quaternion * torch.tensor([1.0, 1, -1, -1]))
         torch.testing.assert_close(after.translation, before.translation * torch.tensor([-1.0, 1, 1]))
     sides = torch.tensor([-1.0, 1, 1])[:, None, None]  # of the bonnet's velocities, which follow from the motion, too
     torch.testing.assert_close(mirrored.velocity_prev, prior.velocity_prev.flip(3) * sides, rtol=0, atol=1e-5)
     torch.testing.assert_close(mirrored.velocity_cur, prior.velocity_cur.flip(3) * sides, rtol=0, atol=1e-5)
+
+
+def test_a_camera_sways_in_the_mirror_as_before_it(window: Window) -> None:
+    """Turns about x and shifts along y and z stay, all others change sign: weights that mix neither kind with the
+    other forecast the mirrored path from mirrored motions."""
+    network = EgoMotion(EgoMotionConfig(widths=(8, 8, 8, 8), blocks=1, heads=2, path=2), 4, "prior").double()
+    assert network.swayed is not None
+    signs = torch.tensor([1.0, -1, -1, -1, 1, 1]).repeat(2).double()
+    with torch.no_grad():
+        network.swayed.weight.copy_(torch.randn(12, 12) * (signs[:, None] == signs))
+    paths = []
+    for each in (window, augment.flip(window)):
+        prior = network_input(each.prev, each.cur, last_motions(each.prev, each.cur)).prior
+        grid, plane = torch.rand(1, 4, 2, 3).double(), torch.ones(1, 1, 2, 3).double()
+        motions = [RigidMotion(*(part.double() for part in motion)) for motion in prior[:3]]
+        answer = network(grid, grid, plane, plane, plane, plane, (motions[0], motions[1], motions[2]))
+        paths.append([geometry.compose_rigid(*motion)[0].detach() for motion in (answer.next_from_cur, *answer.later)])
+        assert not torch.allclose(paths[-1][0], geometry.compose_rigid(*motions[0])[0], atol=1e-3)
+    mirror = torch.diag(torch.tensor([-1.0, 1, 1, 1])).double()
+    for before, after in zip(*paths, strict=True):
+        torch.testing.assert_close(after, mirror @ before @ mirror, rtol=0, atol=1e-6)  # the prior is float32
 
 
 def test_a_right_camera_becomes_a_left_one(window: Window) -> None:
@@ -116,6 +143,7 @@ def test_flipped_twice_a_window_is_as_before(window: Window) -> None:
         assert np.array_equal(after.prev_from_cur, before.prev_from_cur)
     assert np.array_equal(twice.target, window.target) and np.array_equal(twice.tgt_from_next, window.tgt_from_next)
     np.testing.assert_allclose(twice.target_K, window.target_K, rtol=0, atol=1e-14)
+    assert np.array_equal(twice.path_from_cur, window.path_from_cur)
 
 
 def splatted(window: Window) -> torch.Tensor:

@@ -31,7 +31,8 @@ def street(frames: int = 5, seed: int = 3) -> Clip:
 
 
 def setup(**changes: Any) -> Setup:
-    return Setup(**({"protocol": PROTOCOLS["street"], "size": SIZE, "steps": 1, "models": {}} | changes))
+    wanted: dict[str, Any] = {"protocol": PROTOCOLS["street"], "size": SIZE, "steps": 1, "models": {}}
+    return Setup(**(wanted | changes))
 
 
 def eight_bit(image: np.ndarray) -> torch.Tensor:

@@ -7,13 +7,13 @@ from typing import Any
 import pytest
 import torch
 from data_files import real
-from forecaster_scenes import TINY, camera, pair_of, stir
+from forecaster_scenes import SMALL, TINY, camera, pair_of, stir, turning
 
 from train.config import LossConfig
 from train.data import Batch
-from train.losses import NEAREST, build_perceptual, pose_errors, residual_motion, ssim_loss, total_loss
+from train.losses import NEAREST, build_perceptual, path_errors, pose_errors, residual_motion, ssim_loss, total_loss
 from vestcl import geometry, metrics
-from vestcl.models import RigidMotion
+from vestcl.models import EgoMotion, RigidMotion
 from vestcl.models.forecaster import Forecaster, RenderedView, Step
 from vestcl.models.prior import MotionPrior
 from vestcl.models.trunks import Trunk
@@ -120,6 +120,34 @@ def test_unknown_poses_count_as_nothing_and_halves_average_to_the_whole() -> Non
     assert number(pose_errors(moved, truth, torch.tensor([True, False, False, False]))[0]) == pytest.approx(
         number(single[0]) / 4
     )
+
+
+@pytest.mark.parametrize("further", ["forecast", "truth"])
+def test_errors_of_a_path_are_means_over_the_intervals_that_both_have(further: str) -> None:
+    torch.manual_seed(0)
+    way, truth = (rigid(torch.randn(6, 3), torch.randn(6, 3)).unflatten(0, (2, 3)) for _ in range(2))
+    short = {"forecast": (way, truth[:, :2]), "truth": (way[:, :2], truth)}[further]
+    for known in (torch.tensor([True, True]), torch.tensor([False, True])):
+        each = [torch.stack(pose_errors(way[:, i], truth[:, i], known)) for i in range(3)]
+        torch.testing.assert_close(torch.stack(path_errors(way, truth, known)), torch.stack(each).mean(dim=0))
+        got = torch.stack(path_errors(*short, known))
+        torch.testing.assert_close(got, torch.stack(each[:2]).mean(dim=0))
+
+
+def test_an_interval_learns_from_its_own_truth() -> None:
+    """Of three that are forecast, two are known: they learn from both pose terms, and the third learns nothing."""
+    torch.manual_seed(0)
+    model, prior = Forecaster(SMALL), turning(BATCH, HEIGHT, WIDTH)
+    assert isinstance(model.ego_motion, EgoMotion) and model.ego_motion.swayed is not None
+    batch = batch_of(torch.rand(BATCH, 3, HEIGHT, WIDTH), torch.eye(4).repeat(BATCH, 1, 1), [True, True])
+    batch = batch._replace(path_from_cur=torch.eye(4).repeat(BATCH, 2, 1, 1))
+    step = model.forecast(batch.frame_prev, batch.frame_cur, batch.K, views=[], mode="compose", prior=prior)[0]
+    assert step.path_from_cur.shape == (BATCH, 3, 4, 4)
+    config = settings(pose={"rotation": 1.0, "translation": 1.0})
+    total_loss(None, step, batch, config, None)[0].backward()
+    for weight in (model.ego_motion.motion.weight, model.ego_motion.swayed.weight):
+        assert weight.grad is not None
+        assert [bool(grad.any()) for grad in weight.grad.split(6)] == [True, True, False]
 
 
 @pytest.mark.parametrize(("side", "levels"), [(metrics.WINDOW, 1), (43, 2), (44, 3), (100, 4), (176, 5), (400, 5)])

@@ -7,16 +7,16 @@ import pytest
 import torch
 from train_scenes import configured
 
-from train import checkpoint, fit
 from train.data import Batch, loader
 from train.fit import window_set
-from train.trainer import build_model
+from train.ranks import Ranks
+from train.trainer import Trainer, build_model
 from vestcl.data import Street
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare_clip import prepare_clip
 
-#: dB that are to be reached, and updates that may be spent: 31.1 were measured after 240, from 20.
-WANTED, STEPS = 30.0, 250
+#: dB that are to be reached, and updates that may be spent, 0.11 s each on one core: 38.4 were measured, from 26.8.
+WANTED, STEPS = 35.0, 400
 
 
 @pytest.fixture(scope="module")
@@ -28,19 +28,20 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_one_window_is_learnt(cache: Path, tmp_path: Path) -> None:
-    """At 19 x 64 px, for two cores' sake. The camera keeps its measured motion; encoder, objects and image learn."""
+    """24 x 48 px of it, for two cores' sake, from random weights: all four parts learn, from the image alone."""
     settings = configured(
         cache, tmp_path, model="vest-s",
-        data={"crop": None, "scale": [0.4, 0.4], "horizons": [1.0], "right": 0.0, "colour": 0.0, "flip": False},
-        loss={"ssim": 0.0, "pose": {}}, optimiser={"ema": 0.0, "final_factor": 0.05},
-        stages=[{"name": "window", "steps": STEPS, "batch": 1, "learning_rate": 1e-3, "warm_up": 5,
-                 "train": ["encoder", "object_motion", "refine"]}],
-        run={"threads": None, "checkpoint_every": STEPS, "log_every": STEPS},
+        data={"crop": [24, 48], "horizons": [1.0], "right": 0.0, "colour": 0.0, "flip": False},
+        loss={"ssim": 0.0, "pose": {}}, optimiser={"ema": 0.0, "final_factor": 0.01},
+        stages=[{"name": "window", "steps": STEPS, "batch": 1, "learning_rate": 2e-3, "warm_up": 10}],
     )  # fmt: skip
     (batch,) = loader(window_set(settings.data), settings.seed, 1, range(1))
-    before = decibels(build_model(settings), batch)
-    assert fit.fit(settings)
-    after = decibels(Forecaster.load(checkpoint.list_checkpoints(tmp_path)[0] / "model.safetensors"), batch)
+    model = build_model(settings)
+    before = decibels(model, batch)
+    trainer = Trainer(settings, settings.stages[0], model.train(), None, Ranks())
+    for _ in range(STEPS):
+        trainer.update(batch)
+    after = decibels(model, batch)
     assert before < WANTED - 5 and after > WANTED, (before, after)
 
 

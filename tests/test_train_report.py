@@ -38,7 +38,8 @@ def batch_of() -> Batch:
     K, eye = camera(2, HEIGHT, WIDTH), torch.eye(4).repeat(2, 1, 1)
     known = torch.tensor([True, True])
     prior = measured(2, HEIGHT, WIDTH)
-    return Batch(prev, cur, K, prior, 3, torch.rand(2, 3, HEIGHT, WIDTH), eye, K, eye, known, ("a/001", "b/002"))
+    target, path = torch.rand(2, 3, HEIGHT, WIDTH), torch.eye(4).repeat(2, 3, 1, 1)
+    return Batch(prev, cur, K, prior, 3, target, eye, K, eye, path, known, ("a/001", "b/002"))
 
 
 def view_of(image: torch.Tensor) -> RenderedView:
