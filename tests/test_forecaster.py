@@ -110,8 +110,11 @@ def test_the_radius_has_a_gradient() -> None:
     """A point on the optical axis: coming nearer changes nothing but its size, and so what it covers."""
     points, one = torch.tensor([[0.0, 0.0, 10.0]]), torch.ones(1, 1)
     displacement = torch.tensor([[0.0, 0.0, -2.0]], requires_grad=True)
-    beside, starts = torch.zeros(1, 4, dtype=torch.int64), torch.tensor([0, 1])
-    cloud = Cloud(points, displacement, torch.zeros(1, 3), torch.tensor([10.0]), torch.ones(1, 4), one, beside, starts)
+    seen, beside = torch.zeros(1, dtype=torch.bool), torch.zeros(1, 4, dtype=torch.int64)
+    starts = torch.tensor([0, 1])
+    cloud = Cloud(
+        points, displacement, torch.zeros(1, 3), torch.tensor([10.0]), torch.ones(1, 4), one, seen, beside, starts
+    )
     still, K = torch.eye(4)[None], camera(1, 9, 9)
     splat_cloud(cloud, Camera(still, K), K, still, RenderConfig(rho=1.5), 9, 9).coverage.sum().backward()
     assert displacement.grad is not None
@@ -228,3 +231,18 @@ def test_refuses_arguments() -> None:
         model.forecast(*pair, K, steps=0)
     with pytest.raises(ValueError, match='`mode` "feedback" or "compose", got 1 and \'dream\''):
         model.forecast(*pair, K, mode="dream")  # type: ignore[arg-type]
+
+
+def test_what_is_seen_is_never_hidden_by_what_is_inpainted() -> None:
+    """A car drives away from the road that was painted 1 % behind it: it stays in front, but where depth alone rules."""
+    red, green = torch.tensor([[1.0, 0, 0, 1.0]]), torch.tensor([[0, 1.0, 0, 1.0]])
+    xyz, moved = torch.tensor([[0, 0, 10.0], [0, 0, 10.1]]), torch.tensor([[0, 0, 2.0], [0, 0, 0]])
+    one, alone = torch.ones(2, 1), torch.arange(2)[:, None].expand(2, 4)
+    inpainted, starts = torch.tensor([False, True]), torch.tensor([0, 2])
+    cloud = Cloud(xyz, moved, 0 * moved, xyz[:, 2], torch.cat([red, green]), one, inpainted, alone, starts)
+    still, K = torch.eye(4)[None], camera(1, 9, 9)
+    for rule, wanted in (("last", red), ("own", green)):
+        config = RenderConfig(rho=1.5, inpainted=rule)  # type: ignore[arg-type]
+        side = splat_cloud(cloud, Camera(still, K), K, still, config, 9, 9)
+        middle = torch.cat([side.features, side.colour], dim=1)[0, :, 4, 4]
+        assert torch.allclose(middle, wanted[0], atol=0.2) and side.coverage[0, 0, 4, 4] > 0.8

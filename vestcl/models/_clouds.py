@@ -1,13 +1,13 @@
-"""Packed point clouds: both layers of a frame, lifted and moved to a later time.
+"""Packed point clouds: the layers of frames, lifted and moved to a later time.
 
 Clouds of a batch differ in size, so they are packed: image b owns the points starts[b]:starts[b + 1].
 """
 
-import itertools
-from collections.abc import Sequence
+import functools
 from typing import NamedTuple
 
 import torch
+from torch.nn import functional
 
 from vestcl import geometry
 from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
@@ -17,7 +17,7 @@ from vestcl.ops.unproject import unproject
 
 
 class Cloud(NamedTuple):
-    """Points of one input frame's layers, for all B images; gradients flow through all."""
+    """Points of input frames' layers, for all B images; gradients flow through all."""
 
     points_xyz: torch.Tensor
     """[P, 3] m, in a camera of their own."""
@@ -31,6 +31,8 @@ class Cloud(NamedTuple):
     """[P, C + 3]: features and colour."""
     background: torch.Tensor
     """[P, 1]: 1 on the static background."""
+    inpainted: torch.Tensor
+    """bool [P]: what no frame has seen."""
     beside: torch.Tensor
     """int64 [P, 4]: which points are to the left, to the right, above and below in the frame that they come from; where
     there is none, and for inpainted points, the point itself."""
@@ -41,18 +43,10 @@ class Cloud(NamedTuple):
     def sizes(self) -> list[int]:
         return self.starts.diff().tolist()
 
-
-def hidden_pixels(mask: torch.Tensor) -> list[torch.Tensor]:
-    """Per image the indices of the pixels with M = 0: [B, 1, H, W] -> B times int64 [n_b]."""
-    return [(image < FOREGROUND_BELOW).nonzero()[:, 0] for image in mask.flatten(1)]
-
-
-def pack(pixels: torch.Tensor, inpainted: torch.Tensor, hidden: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Image after image all of ``pixels`` and then ``inpainted`` where hidden: two [B, N, D] -> [P, D]."""
-    pieces = []
-    for image, behind, where in zip(pixels, inpainted, hidden, strict=True):
-        pieces += [image, behind.index_select(0, where)]
-    return torch.cat(pieces)
+    def picked(self, points: torch.Tensor, starts: torch.Tensor) -> "Cloud":
+        """Some points alone, by their rising indices [Q]; ``starts`` [B + 1] among those. They have no neighbours."""
+        alone = torch.arange(len(points))[:, None].expand(-1, 4)
+        return Cloud._make([*(tensor.index_select(0, points) for tensor in self[:-2]), alone, starts])
 
 
 def as_points(image: torch.Tensor) -> torch.Tensor:
@@ -65,56 +59,84 @@ def as_image(points: torch.Tensor, height: int, width: int) -> torch.Tensor:
     return points.unflatten(1, (height, width)).permute(0, 3, 1, 2)
 
 
-def lift(
-    frame: EncodedFrame, to_next: RigidMotion, flow: torch.Tensor, flow0: torch.Tensor, intervals: int, K: torch.Tensor
-) -> Cloud:
-    """A frame's cloud: each pixel, and the inpainted background where there is foreground.
+def lift(frame: EncodedFrame, flow: torch.Tensor, flow0: torch.Tensor, intervals: int, K: torch.Tensor) -> Cloud:
+    """What a frame shows: each pixel.
 
     Args:
         frame: B of them.
-        to_next: the camera's motion, which inpainted points follow.
         flow: [B, 3, H, W] m, that pixels follow.
         flow0: the same without what objects do.
         intervals: of frames that both span.
         K: [B, 3, 3] px.
 
     Returns:
-        The cloud with H W + |M = 0| points an image; differentiable in all but ``K``.
+        The cloud with H W points an image; differentiable in all but ``K``.
     """
-    layers, hidden = frame.layers, hidden_pixels(frame.layers.mask)
-    behind = unproject(layers.background_depth, K)
-    still = torch.zeros_like(behind)
-    shown = torch.cat([frame.features, layers.image], dim=1)
-    shown_behind = torch.cat([frame.background_features, layers.background_image], dim=1)
-    sizes = torch.tensor([0] + [behind.shape[1] + len(where) for where in hidden]).cumsum(0)
+    layers = frame.layers
+    batch, _, height, width = layers.image.shape
+    moving = as_points(torch.cat([flow, (flow - flow0) / intervals, frame.features, layers.image], dim=1)).flatten(0, 1)
+    starts = torch.arange(batch + 1) * (height * width)
     return Cloud(
-        points_xyz=pack(unproject(layers.depth, K), behind, hidden),
-        displacement_xyz=pack(as_points(flow), rigid_flow(behind, *to_next), hidden),
-        step_xyz=pack(as_points((flow - flow0) / intervals), still, hidden),
-        depth=pack(as_points(layers.depth), as_points(layers.background_depth), hidden)[:, 0],
-        shown=pack(as_points(shown), as_points(shown_behind), hidden),
-        background=pack(as_points(layers.mask), still[..., :1] + 1, hidden),
-        beside=_neighbours(sizes.tolist(), *layers.image.shape[2:]),
-        starts=sizes,
+        unproject(layers.depth, K).flatten(0, 1),
+        moving[:, :3],
+        moving[:, 3:6],
+        layers.depth.flatten(),
+        moving[:, 6:],
+        layers.mask.reshape(-1, 1),
+        torch.zeros(batch * height * width, dtype=torch.bool),
+        _neighbours(height, width).repeat(batch, 1) + starts[:-1].repeat_interleave(height * width)[:, None],
+        starts,
     )
 
 
-def _neighbours(starts: Sequence[int], height: int, width: int) -> torch.Tensor:
-    """`Cloud.beside` of images whose H W pixels come first from ``starts`` on, the last of which is their end."""
+def lift_hidden(frame: EncodedFrame, to_next: RigidMotion, K: torch.Tensor) -> Cloud:
+    """What a frame's foreground hides: the inpainted background where M = 0, which stands still in the world.
+
+    Args:
+        frame: B of them.
+        to_next: the camera's motion.
+        K: [B, 3, 3] px.
+
+    Returns:
+        The cloud with |M = 0| points an image; differentiable in all but ``K``.
+    """
+    layers = frame.layers
+    hidden = (layers.mask < FOREGROUND_BELOW).flatten()
+    where = hidden.nonzero()[:, 0]
+    points = unproject(layers.background_depth, K)
+    shown = torch.cat([frame.background_features, layers.background_image], dim=1)
+
+    def pick(points: torch.Tensor) -> torch.Tensor:
+        return points.flatten(0, 1).index_select(0, where)
+
+    return Cloud(
+        pick(points),
+        pick(rigid_flow(points, *to_next)),
+        points.new_zeros(len(where), 3),
+        layers.background_depth.flatten()[where],
+        pick(as_points(shown)),
+        points.new_ones(len(where), 1),
+        torch.ones(len(where), dtype=torch.bool),
+        torch.arange(len(where))[:, None].expand(-1, 4),
+        functional.pad(hidden.view(len(layers.mask), -1).sum(dim=1).cumsum(0), (1, 0)),
+    )
+
+
+@functools.lru_cache(maxsize=4)
+def _neighbours(height: int, width: int) -> torch.Tensor:
+    """`Cloud.beside` of one image."""
     place = torch.arange(height * width).view(height, width)
     sides = [
         torch.cat([place[:, :1], place[:, :-1]], dim=1), torch.cat([place[:, 1:], place[:, -1:]], dim=1),
         torch.cat([place[:1], place[:-1]], dim=0), torch.cat([place[1:], place[-1:]], dim=0),
     ]  # fmt: skip
-    of_pixels, alone = torch.stack(sides, dim=2).flatten(0, 1), torch.arange(starts[-1])[:, None].expand(-1, 4)
-    pieces = []
-    for start, end in itertools.pairwise(starts):
-        pieces += [of_pixels + start, alone[start + height * width : end]]
-    return torch.cat(pieces)
+    return torch.stack(sides, dim=2).flatten(0, 1)
 
 
 def join(first: Cloud, second: Cloud) -> Cloud:
-    """One cloud an image of both, ``first`` before ``second``."""
+    """One cloud an image of both, ``first`` before ``second``; the other one itself where one has no points."""
+    if not (len(first.depth) and len(second.depth)):
+        return first if len(first.depth) else second
     sizes = first.sizes, second.sizes
 
     def alternate(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:

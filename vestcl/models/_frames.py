@@ -6,7 +6,7 @@ import torch
 from torch.nn import functional
 
 from vestcl.models._layers import check
-from vestcl.models.encoder import STRIDE
+from vestcl.models.encoder import STRIDE, upsample_features
 from vestcl.scene.layers import LayerBatch
 
 #: A mask's pixel below is foreground, whatever a resize made of 0 and 1.
@@ -22,8 +22,13 @@ class EncodedFrame(NamedTuple):
     """[B, C, H, W]."""
     background_grid: torch.Tensor
     """[B, C, ceil(H / 4), ceil(W / 4)], of the background: the encoder's own grid."""
-    background_features: torch.Tensor
-    """[B, C, H, W]; ``features`` itself where no image has foreground."""
+    same: bool
+    """Whether the backgrounds are the frames themselves."""
+
+    @property
+    def background_features(self) -> torch.Tensor:
+        """[B, C, H, W]; ``features`` itself where no image has foreground."""
+        return self.features if self.same else upsample_features(self.background_grid, *self.features.shape[2:])
 
 
 def check_frames(frame_prev: LayerBatch, frame_cur: LayerBatch, K: torch.Tensor) -> None:

@@ -45,10 +45,10 @@ def perceive_view(view: RenderedView, perceive: Perceive) -> LayerBatch:
     return LayerBatch(*(tensor.detach().to(view.depth) for tensor in seen))
 
 
-def straight_view(cameras: Sequence[Camera], views: Sequence[RenderedView], straight: Camera) -> RenderedView | None:
-    """The view, where one was asked for, of the source camera."""
+def known_view(cameras: Sequence[Camera], views: Sequence[RenderedView], wanted: Camera) -> RenderedView | None:
+    """The view, where there is one, of the camera ``wanted``."""
     for camera, view in zip(cameras, views, strict=True):
-        if all(torch.equal(one, other) for one, other in zip(camera, straight, strict=True)):
+        if all(torch.equal(one, other) for one, other in zip(camera, wanted, strict=True)):
             return view
     return None
 

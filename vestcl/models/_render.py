@@ -1,20 +1,29 @@
 """What a camera sees of the clouds: a splat of each, and what follows from both."""
 
+import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import torch
+from torch.nn import functional
 
 from vestcl import constants
 from vestcl.models._clouds import Cloud, last_motion
 from vestcl.models._layers import check
 from vestcl.models.config import LEAST_COVERAGE, RenderConfig
+from vestcl.models.skipping import Tally
 from vestcl.ops.displace import displace
 from vestcl.ops.splat import composite, rasterize
+from vestcl.scene.layers import SKY_DEPTH
 
 #: Pixels that were next to each other belong to one surface if the view shows them no farther apart than that, times
 #: what it magnifies (as in vestcl/geometric/render.py).
 _TORN: Final = 2.5
+
+#: Metres that inpainted points go farther back in the splatter's order, where they come last: what a frame has not seen
+#: never hides what it has. An inpainted point stands still 1 % behind the object that hides it, and a car that drives
+#: ahead of us would soon be behind the road that it was painted over.
+_BEHIND: Final = 4 * SKY_DEPTH
 
 #: Limits of a footprint's radius, px: half the splatter's tile, and where a footprint can miss every pixel centre.
 RADIUS: Final = (0.5, constants.TILE / 2)
@@ -84,6 +93,8 @@ def splat_cloud(
     config: RenderConfig,
     height: int,
     width: int,
+    open_: torch.Tensor | None = None,
+    tally: Tally | None = None,
 ) -> Side:
     """Show a cloud in ``camera``: opaque points of radius r = rho z_src / z_tgt f_tgt / f_src, clamped to RADIUS.
 
@@ -98,6 +109,8 @@ def splat_cloud(
         config: rho, the radius in source pixels.
         height: rows of the view.
         width: columns of the view.
+        open_: bool [B, 1, H, W], the pixels that count: others may be left empty. None is all.
+        tally: is told how many points that left out; None leaves out none.
 
     Returns:
         What is seen; differentiable in the cloud, through positions, radii and inverse depth.
@@ -111,13 +124,43 @@ def splat_cloud(
         stretch, opacities = _surface(points_uv.detach(), magnified.detach(), cloud.beside)
         magnified = magnified * stretch
     radii = (config.rho * magnified).clamp(*RADIUS)
-    raster = rasterize(points_uv, z.detach(), radii, opacities, height, width, cloud_starts=cloud.starts)
+    order = z.detach()
+    if config.inpainted == "last":
+        order = order + _BEHIND * cloud.inpainted
+    starts = cloud.starts
+    if open_ is not None and tally is not None:
+        kept = _reaching(points_uv.detach(), radii.detach(), cloud.starts, open_)
+        tally.add("covered", len(z) - len(kept), len(z), "points")
+        starts = torch.searchsorted(kept, starts)
+        cloud = cloud.picked(kept, starts)
+        points_uv, order, near, radii, opacities = (t[kept] for t in (points_uv, order, near, radii, opacities))
+    raster = rasterize(points_uv, order, radii, opacities, height, width, cloud_starts=starts)
     image, coverage = composite(raster, torch.cat([cloud.shown, near.reciprocal()[:, None]], dim=1))
     features, colour, inverse_depth = image.split([image.shape[1] - 4, 3, 1], dim=1)
     with torch.no_grad():
         known = torch.cat([cloud.background, last_motion(cloud, next_from_cur) / near[:, None]], dim=1)
         background, inverse_motion = composite(raster, known)[0].split([1, 3], dim=1)
     return Side(features, colour, coverage, inverse_depth, background, inverse_motion)
+
+
+def _reaching(points_uv: torch.Tensor, radii: torch.Tensor, starts: torch.Tensor, open_: torch.Tensor) -> torch.Tensor:
+    """Indices of the points whose footprints may reach an open pixel, and some of their neighbours.
+
+    Args:
+        points_uv: [P, 2] px.
+        radii: [P] px.
+        starts: [B + 1].
+        open_: bool [B, 1, H, W].
+    """
+    height, width = open_.shape[2:]
+    around = math.ceil(radii.max().item()) + 1 if len(radii) else 1
+    wide = functional.max_pool2d(open_.to(radii), (2 * around + 1, 1), stride=1, padding=(around, 0))
+    wide = functional.max_pool2d(wide, (1, 2 * around + 1), stride=1, padding=(0, around))
+    column, row = points_uv.nan_to_num(-1).floor().long().unbind(1)
+    inside = (row >= -around) & (row < height + around) & (column >= -around) & (column < width + around)
+    image = torch.arange(len(open_)).repeat_interleave(starts.diff())
+    place = (image * height + row.clamp(0, height - 1)) * width + column.clamp(0, width - 1)
+    return (inside & (wide.flatten()[place] > 0)).nonzero()[:, 0]
 
 
 def _surface(

@@ -44,7 +44,10 @@ RHO: Final = 1.5
 #: A pixel that is covered by less has no depth of its own: one footprint's outermost tenth alone is on it.
 LEAST_COVERAGE: Final = 0.1
 
-#: The same where colour is shown directly, and refinement only adds to it (SPEC section 2).
+#: From this coverage on a side hides what is behind it: only cracks between a surface's points let it through.
+OPAQUE: Final = 0.5
+
+#: The same as RHO where colour is shown directly, and refinement only adds to it (SPEC section 2).
 RHO_DIRECT: Final = 0.95
 
 
@@ -60,6 +63,9 @@ class EncoderConfig:
     """Channels of the decoder at H/8 and, before layer 1 joins it, at H/4."""
     features: int = 32
     """Channels out."""
+    background: Literal["own", "frame"] = "own"
+    """"own": the inpainted background is a picture of its own. "frame": it is normalised by its frame's statistics, and
+    where it is the frame itself, so are its features: then it need only be encoded where they differ."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +113,8 @@ class ObjectMotionConfig:
     """Channels of branch A; multiples of 4."""
     detail: int = 8
     """Channels of branch B, at full resolution."""
+    where: Literal["everywhere", "foreground"] = "everywhere"
+    """"foreground": what the mask says is static background keeps the motion that object motion starts from."""
     routing: RoutingConfig | None = None
     """None runs every block."""
 
@@ -133,6 +141,11 @@ class RenderConfig:
     """Radius in source pixels."""
     stretched: bool = False
     """Radii grow with the distance between a surface's points, and points without a surface are left out."""
+    inpainted: Literal["own", "last"] = "own"
+    """"own": the background behind a frame's foreground is part of that frame's cloud, at its own depth. "last": only
+    the current frame's is shown, as part of the previous frame's cloud, and behind all that this one has seen."""
+    previous: Literal["all", "uncovered"] = "all"
+    """"uncovered": the previous frame's cloud shows only where the current one's covers less than OPAQUE."""
     normalised: bool = False
     """Features, colour and inverse depth go into refinement divided by coverage; False leaves them times coverage."""
 
@@ -197,10 +210,12 @@ VEST_PAPER: Final = ModelConfig("vest-paper")
 
 VEST_S: Final = ModelConfig(
     "vest-s",
-    encoder=EncoderConfig(widths=(24, 48, 96), blocks=(2, 2, 2), decoder=(48, 32), features=16),
+    encoder=EncoderConfig(widths=(24, 48, 96), blocks=(2, 2, 2), decoder=(48, 32), features=16, background="frame"),
     ego_motion=EgoMotionConfig(widths=(32, 32, 64, 64), path=5),
-    object_motion=ObjectMotionConfig("dmvfn", scales=(4, 4, 2, 2, 1, 1), widths=(64, 64, 32, 32, 16, 16), detail=8),
-    render=RenderConfig(rho=RHO_DIRECT, stretched=True, normalised=True),
+    object_motion=ObjectMotionConfig(
+        "dmvfn", scales=(4, 4, 2, 2, 1, 1), widths=(64, 64, 32, 32, 16, 16), detail=8, where="foreground"
+    ),
+    render=RenderConfig(rho=RHO_DIRECT, stretched=True, inpainted="last", previous="uncovered", normalised=True),
     refine=RefineConfig(stem=16, stem_kernel=3, widths=(32, 64, 96, 128), base="filled"),
     start="prior",
 )

@@ -9,11 +9,15 @@ from torch import nn
 from torch.nn import functional
 
 from vestcl.models._layers import channels_last, check, group_norm, upsample
+from vestcl.models._norm import Normalise, own
 from vestcl.models._weights import read_state_dict
 from vestcl.models.config import ENCODER_GROUP, EncoderConfig
 
 #: Pixels of the image a cell of the features, in both directions.
 STRIDE: Final = 4
+
+#: Pixels of the image a cell of the coarsest features.
+COARSEST: Final = 16
 
 #: Mean and standard deviation of ImageNet's images (RGB in [0, 1]), which its networks expect at 0 and 1.
 IMAGENET_MEAN: Final = (0.485, 0.456, 0.406)
@@ -54,11 +58,12 @@ class Encoder(nn.Module):
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
-    def forward(self, image: torch.Tensor) -> torch.Tensor:
+    def forward(self, image: torch.Tensor, norm: Normalise = own) -> torch.Tensor:
         """Encode a batch of images.
 
         Args:
             image: [B, 3, H, W] RGB in [0, 1], of any size.
+            norm: by which statistics it is normalised: `vestcl.models._norm`.
 
         Returns:
             features [B, features, ceil(H / 4), ceil(W / 4)]; differentiable. `upsample_features` brings them to H x W.
@@ -67,14 +72,14 @@ class Encoder(nn.Module):
             ValueError: ``image`` is not floating point [B, 3, H, W].
         """
         check(image=(image, "B 3 H W"))
-        stem = functional.relu(self.norm1(self.conv1(normalise(image))))
-        at4 = self.layer1(functional.max_pool2d(stem, 3, stride=2, padding=1))
-        at8 = self.layer2(at4)
-        at16 = self.layer3(at8)
-        up = self.up2(upsample(at16, 2, *at8.shape[-2:]))
-        up = self.join2(torch.cat([up, at8], dim=1))
-        up = self.up1(upsample(up, 2, *at4.shape[-2:]))
-        up = self.join1(torch.cat([up, at4], dim=1))
+        stem = functional.relu(norm(self.norm1, self.conv1(normalise(image))))
+        at4 = self.layer1(functional.max_pool2d(stem, 3, stride=2, padding=1), norm)
+        at8 = self.layer2(at4, norm)
+        at16 = self.layer3(at8, norm)
+        up = self.up2(upsample(at16, 2, *at8.shape[-2:]), norm)
+        up = self.join2(torch.cat([up, at8], dim=1), norm)
+        up = self.up1(upsample(up, 2, *at4.shape[-2:]), norm)
+        up = self.join1(torch.cat([up, at4], dim=1), norm)
         return self.out(up)
 
 
@@ -87,15 +92,38 @@ class ResidualBlock(nn.Module):
         self.norm1 = group_norm(channels, ENCODER_GROUP)
         self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
         self.norm2 = group_norm(channels, ENCODER_GROUP)
-        self.downsample: nn.Module = nn.Identity()
+        self.downsample: nn.Module = Chain()
         if stride != 1 or channels_in != channels:
             convolution = nn.Conv2d(channels_in, channels, 1, stride=stride, bias=False)
-            self.downsample = nn.Sequential(convolution, group_norm(channels, ENCODER_GROUP))
+            self.downsample = Chain(convolution, group_norm(channels, ENCODER_GROUP))
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x: torch.Tensor, norm: Normalise = own) -> torch.Tensor:
         """[B, channels_in, H, W] -> [B, channels, ceil(H / stride), ceil(W / stride)]."""
-        inner = functional.relu(self.norm1(self.conv1(x)))
-        return functional.relu(self.norm2(self.conv2(inner)) + self.downsample(x))
+        inner = functional.relu(norm(self.norm1, self.conv1(x)))
+        return functional.relu(norm(self.norm2, self.conv2(inner)) + self.downsample(x, norm))
+
+
+class Chain(nn.Sequential):
+    """Modules one after the other, told how to normalise."""
+
+    def forward(self, x: torch.Tensor, norm: Normalise = own) -> torch.Tensor:
+        """x through all of them."""
+        for module in self:
+            if isinstance(module, nn.GroupNorm):
+                x = norm(module, x)
+            else:
+                x = module(x, norm) if isinstance(module, ResidualBlock) else module(x)
+        return x
+
+
+def reach(config: EncoderConfig) -> int:
+    """Pixels beyond a cell of the features that they may depend on, brought to the image's size.
+
+    A 3x3 conv on cells of s pixels reaches s further, the stem's 7x7 one 3; bilinear enlarging reaches a coarse cell.
+    """
+    first, second, third = (2 * blocks for blocks in config.blocks)
+    trunk = 3 + 2 + 4 * first + (4 + 8 * (second - 1)) + (8 + 16 * (third - 1))
+    return trunk + (16 + 8 + 8) + (8 + 4 + 4) + STRIDE
 
 
 def upsample_features(features: torch.Tensor, height: int, width: int) -> torch.Tensor:
@@ -150,13 +178,13 @@ def normalise(image: torch.Tensor) -> torch.Tensor:
     return channels_last((image - mean) / std)
 
 
-def _layer(channels_in: int, channels: int, blocks: int, stride: int) -> nn.Sequential:
+def _layer(channels_in: int, channels: int, blocks: int, stride: int) -> Chain:
     first = ResidualBlock(channels_in, channels, stride)
-    return nn.Sequential(first, *(ResidualBlock(channels, channels, 1) for _ in range(blocks - 1)))
+    return Chain(first, *(ResidualBlock(channels, channels, 1) for _ in range(blocks - 1)))
 
 
-def _decoder_conv(channels_in: int, channels: int) -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(channels_in, channels, 3, padding=1), group_norm(channels, ENCODER_GROUP), nn.ELU())
+def _decoder_conv(channels_in: int, channels: int) -> Chain:
+    return Chain(nn.Conv2d(channels_in, channels, 3, padding=1), group_norm(channels, ENCODER_GROUP), nn.ELU())
 
 
 def _trunk(encoder: Encoder) -> Iterator[tuple[str, nn.Parameter]]:

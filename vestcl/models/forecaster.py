@@ -8,10 +8,12 @@ import torch
 from torch import nn
 
 from vestcl.models._checkpoint import read_checkpoint, write_checkpoint
-from vestcl.models._clouds import Cloud, advance, as_image, join, lift
-from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame, check_frames, grid_depth, grid_mean, with_depth
+from vestcl.models._clouds import Cloud, advance, as_image, join, lift, lift_hidden
+from vestcl.models._encode import Memory, encode, version
+from vestcl.models._frames import EncodedFrame, check_frames, grid_depth, grid_mean, with_depth
 from vestcl.models._motion import INTERVALS, Motion, Step, arrived, next_prior
-from vestcl.models._perceive import Perceive, perceive_forecast, perceive_view, straight_view
+from vestcl.models._objects import move_objects, unmoved
+from vestcl.models._perceive import Perceive, known_view, perceive_forecast, perceive_view
 from vestcl.models._render import (
     Camera,
     RenderedView,
@@ -21,12 +23,13 @@ from vestcl.models._render import (
     refined_channels,
     splat_cloud,
 )
-from vestcl.models.config import LOG_DEPTH_FAR, ModelConfig
+from vestcl.models.config import OPAQUE, ModelConfig
 from vestcl.models.ego_motion import CameraMotion, EgoMotion, RigidMotion
-from vestcl.models.encoder import Encoder, upsample_features
+from vestcl.models.encoder import Encoder
 from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
 from vestcl.models.prior import MotionPrior, beside, check_prior
 from vestcl.models.refine import Refine
+from vestcl.models.skipping import Skip, Tally
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
 from vestcl.scene.layers import LayerBatch
@@ -60,6 +63,9 @@ class Forecaster(nn.Module):
         #: Encoder and refinement compute in this type (torch.bfloat16, or None for the parameters' own): motion, which
         #: is millimetres in hundreds of metres, never does.
         self.autocast: torch.dtype | None = None
+        #: What is not computed where a scene does not need it, and how much that has been so far.
+        self.skip, self.tally = Skip(), Tally()
+        self._memory = Memory()
 
     def forward(
         self,
@@ -125,7 +131,7 @@ class Forecaster(nn.Module):
         future_from_cur, path_from_cur = motion.rigid, motion.path(steps)
         while True:
             step = len(done) + 1
-            seen = [self.show(clouds, camera, motion, K) for camera in cameras] if step in shown else []
+            seen = self._show_all(clouds, cameras, motion, K) if step in shown else []
             done.append(Step(seen, motion, future_from_cur, path_from_cur))
             if step == steps:
                 return done
@@ -133,7 +139,7 @@ class Forecaster(nn.Module):
                 motion = motion.following()
                 clouds = [advance(cloud, motion.rigid) for cloud in clouds]
             else:
-                looked = straight_view(cameras, seen, straight) if seen else None
+                looked = known_view(cameras, seen, straight) if seen else None
                 view = looked or self.show(clouds, straight, motion, K)
                 prior = None if prior is None else next_prior(prior, motion, view, K)
                 prev, cur = cur, self.encode(perceive_view(view, perceive or perceive_forecast))
@@ -166,7 +172,7 @@ class Forecaster(nn.Module):
         prev, cur = self.encode(frame_prev), self.encode(frame_cur)
         motion = arrived(prev, cur, K, self.move_camera(prev, cur, prior) if prior is None else prior)
         clouds = self.lift(prev, cur, motion, K)
-        return [self.show(clouds, camera, motion, K) for camera in cameras]
+        return self._show_all(clouds, cameras, motion, K)
 
     # ---------------------------------------------------------------- the figure, from left to right
 
@@ -181,19 +187,17 @@ class Forecaster(nn.Module):
             Features [B, C, H, W], and depths replaced where the configuration fixes them.
         """
         layers = with_depth(frame, self.config.fixed_depth)
-        batch, _, height, width = layers.image.shape
-        has_foreground = (layers.mask < FOREGROUND_BELOW).flatten(1).any(dim=1)
+        key = None if torch.is_grad_enabled() else self._encoding()
+        known = None if key is None else self._memory.find(key, frame)
+        if key is not None:
+            self.tally.add("seen", len(frame.image) * (known is not None), len(frame.image), "frames")
+        if known is not None:
+            return known
         with self._autocast():
-            grid = self.encoder(torch.cat([layers.image, layers.background_image[has_foreground]]))
-        grid = grid.to(layers.image.dtype)
-        own = grid[:batch]
-        features = upsample_features(own, height, width)
-        if not has_foreground.any():
-            return EncodedFrame(layers, features, own, features)
-        rows = torch.arange(batch)
-        rows[has_foreground] = torch.arange(batch, len(grid))
-        background = grid.index_select(0, rows)
-        return EncodedFrame(layers, features, background, upsample_features(background, height, width))
+            encoded = encode(self.encoder, self.config.encoder, layers, self.skip, self.tally)
+        if key is not None:
+            self._memory.keep(key, frame, encoded)
+        return encoded
 
     def move(self, prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, prior: MotionPrior | None = None) -> Motion:
         """The camera's motion from both frames to the next, the rigid flow that it makes, and the objects' flow.
@@ -236,27 +240,10 @@ class Forecaster(nn.Module):
         flow0: torch.Tensor,
         start: torch.Tensor,
     ) -> ObjectMotionForecast:
-        """OMF at full size, [B, 6, H, W] m in and out; ``start`` is what it corrects.
-
-        The sky's rigid flow is hundreds of metres in any bend, which no convolution should see: with (R - I) x scaled
-        to a depth of LOG_DEPTH_FAR it is as far as the networks' depth goes. What was taken off is added again.
-        """
+        """OMF at full size, [B, 6, H, W] m in and out; ``start`` is what it corrects."""
         if self.object_motion is None or self.object_motion.changes_nothing:
-            none = torch.zeros(len(start), 0, dtype=torch.bool)
-            return ObjectMotionForecast(start, [], none, None)
-        frames = prev, cur
-        beyond = torch.cat([
-            (1 - LOG_DEPTH_FAR / frame.layers.depth).clamp(min=0) * (flow - rigid.translation[:, :, None, None])
-            for frame, rigid, flow in zip(frames, to_next[:2], flow0.split(3, dim=1), strict=True)
-        ], dim=1)  # fmt: skip
-        objects = self.object_motion(
-            *(frame.features for frame in frames),
-            *(frame.layers.depth for frame in frames),
-            *(frame.layers.mask for frame in frames),
-            start - beyond,
-        )
-        candidates = [candidate + beyond for candidate in objects.candidates]
-        return objects._replace(flow=objects.flow + beyond, candidates=candidates)
+            return unmoved(start)
+        return move_objects(self.object_motion, prev, cur, to_next, flow0, start, self.skip, self.tally)
 
     def lift(self, prev: EncodedFrame, cur: EncodedFrame, motion: Motion, K: torch.Tensor) -> list[Cloud]:
         """Both frames' layers as clouds on their way to t + 1; with `RenderConfig.joint` as one.
@@ -268,12 +255,17 @@ class Forecaster(nn.Module):
             K: [B, 3, 3] px.
 
         Returns:
-            N = H W + |M = 0| points an image and frame, packed.
+            Both frames' points, packed: N = H W + |M = 0| an image and frame, or as `RenderConfig.inpainted` says.
         """
-        rigid = motion.next_from_prev, motion.next_from_cur
+        rigid, render = (motion.next_from_prev, motion.next_from_cur), self.config.render
         flows, flows0 = motion.objects.flow.split(3, dim=1), motion.flow0.split(3, dim=1)
-        clouds = [lift(*arguments, K) for arguments in zip((prev, cur), rigid, flows, flows0, INTERVALS, strict=True)]
-        return [join(*clouds)] if self.config.render.joint else clouds
+        of_prev, of_cur = (lift(*arguments, K) for arguments in zip((prev, cur), flows, flows0, INTERVALS, strict=True))
+        behind_cur = lift_hidden(cur, rigid[1], K)
+        if render.inpainted == "last":
+            clouds = [join(of_prev, behind_cur), of_cur]
+        else:
+            clouds = [join(of_prev, lift_hidden(prev, rigid[0], K)), join(of_cur, behind_cur)]
+        return [join(*clouds)] if render.joint else clouds
 
     def show(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> RenderedView:
         """Splat each cloud into a camera, and paint the image.
@@ -290,11 +282,28 @@ class Forecaster(nn.Module):
         sides = self.splat(clouds, camera, motion, K)
         return compose_view(sides, self.paint(sides))
 
+    def _show_all(
+        self, clouds: Sequence[Cloud], cameras: Sequence[Camera], motion: Motion, K: torch.Tensor
+    ) -> list[RenderedView]:
+        """`show` in each camera, and in one that comes twice once."""
+        views: list[RenderedView] = []
+        for camera in cameras:
+            known = known_view(cameras[: len(views)], views, camera) if self.skip.views else None
+            self.tally.add("views", known is not None, 1, "views")
+            views.append(known or self.show(clouds, camera, motion, K))
+        return views
+
     def splat(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> list[Side]:
         """What each cloud leaves on the view; arguments as in `show`."""
         height, width = motion.flow0.shape[2:]
-        rigid, render = motion.rigid.detach(), self.config.render
-        return [splat_cloud(cloud, camera, K, rigid, render, height, width) for cloud in clouds]
+        known = camera, K, motion.rigid.detach(), self.config.render, height, width
+        if self.config.render.previous == "all" or len(clouds) == 1:
+            return [splat_cloud(cloud, *known) for cloud in clouds]
+        prev, cur = clouds
+        front = splat_cloud(cur, *known)
+        uncovered = front.coverage.detach() < OPAQUE
+        behind = splat_cloud(prev, *known, uncovered, self.tally if self.skip.covered else None)
+        return [Side(*(plane * uncovered for plane in behind)), front]
 
     def paint(self, sides: Sequence[Side]) -> torch.Tensor:
         """The refined image [B, 3, H, W], from the channels that `RenderConfig.channels` counts."""
@@ -310,6 +319,11 @@ class Forecaster(nn.Module):
             raise ValueError(f"`prior` must be {wanted} for {self.config.name}, which starts from {self.config.start}")
         if prior is not None:
             check_prior(prior, frame_cur.image)
+
+    def _encoding(self) -> object:
+        """What features depend on beside the frame; None where they are not remembered."""
+        known = version(self.encoder) if self.skip.seen else None
+        return known and (known, self.skip, self.autocast)
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast("cpu", self.autocast, enabled=self.autocast is not None)

@@ -47,7 +47,7 @@ class ObjectMotion(nn.Module):
     def __init__(self, config: ObjectMotionConfig | None = None, features: int = 32) -> None:
         super().__init__()
         config = config or ObjectMotionConfig()
-        self.scales, self.features = config.scales, features
+        self.config, self.scales, self.features = config, config.scales, features
         frames = 2 * (features + 2)
         self.blocks = nn.ModuleList(
             MotionBlock(frames, config.shape, scale, width, config.detail)
@@ -97,9 +97,24 @@ class ObjectMotion(nn.Module):
         return ObjectMotionForecast(flow[..., :height, :width], cut, gates.detach().bool(), probabilities)
 
     @property
+    def reach(self) -> int:
+        """Pixels beyond a pixel that its motion may depend on: what the blocks reach, added up.
+
+        A conv on cells of s pixels reaches s further, and so does bilinear resizing to or from them; and a cell of a
+        stride begins up to a cell before the pixel.
+        """
+        of_block = (lambda s: 28 * s + 2) if self.config.shape == "dmvfn" else (lambda s: 8 * s + 1)
+        return sum(map(of_block, self.scales))
+
+    @property
+    def learns(self) -> bool:
+        """Whether gradients are recorded for any of its parameters."""
+        return torch.is_grad_enabled() and any(parameter.requires_grad for parameter in self.parameters())
+
+    @property
     def changes_nothing(self) -> bool:
         """Whether it is as it was made, dU = 0, and nothing is to learn: then U = U^0, and it need not run."""
-        if torch.is_grad_enabled() and any(parameter.requires_grad for parameter in self.parameters()):
+        if self.learns:
             return False
         last = [block.get_submodule("out") for block in self.blocks]
         return not any(parameter.any() for layer in last for parameter in layer.parameters())

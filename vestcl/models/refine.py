@@ -1,16 +1,11 @@
 """Refinement: a U-Net that makes the image out of what the clouds left on the new view."""
 
-from typing import Final
-
 import torch
 from torch import nn
 from torch.nn import functional
 
 from vestcl.models._layers import channels_last, check, group_norm, upsample
-from vestcl.models.config import LEAST_COVERAGE, REFINE_GROUP, RefineConfig, RenderConfig
-
-#: From this coverage on a side hides what is behind it: only cracks between a surface's points let it through.
-_OPAQUE: Final = 0.5
+from vestcl.models.config import LEAST_COVERAGE, OPAQUE, REFINE_GROUP, RefineConfig, RenderConfig
 
 
 class Refine(nn.Module):
@@ -23,7 +18,7 @@ class Refine(nn.Module):
     Without a base it paints sigmoid(y). With one it gives b + y, with y exactly 0 at the start; out of training that
     is clamped to [0, 1]. "splatted" takes the rendered colour (premultiplied with coverage), current frame over
     previous frame, b = c_cur + (1 - coverage_cur) c_prev. "filled" takes colours divided by coverage, opaque from
-    _OPAQUE on, the current frame over the previous one, and `fill`s what is left.
+    OPAQUE on, the current frame over the previous one, and `fill`s what is left.
 
     Source: SPEC section 6; 3D Moments (CVPR 2022). There, four max-pools face five doublings, and the first doubled
     image is cut to its middle to fit; here the bottleneck has a max-pool of its own.
@@ -86,7 +81,7 @@ class Refine(nn.Module):
         for side in rendered.chunk(1 if self.render.joint else 2, dim=1):
             colour, coverage = side[:, self.features :].split([3, 1, 1], dim=1)[:2]
             if self.base == "filled":
-                coverage = ((coverage - LEAST_COVERAGE) / (_OPAQUE - LEAST_COVERAGE)).clamp(0, 1)
+                coverage = ((coverage - LEAST_COVERAGE) / (OPAQUE - LEAST_COVERAGE)).clamp(0, 1)
                 colour = colour * coverage
             image, opacity = colour + (1 - coverage) * image, coverage + (1 - coverage) * opacity
         return fill(image, opacity) if self.base == "filled" else image

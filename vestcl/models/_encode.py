@@ -1,0 +1,108 @@
+"""Frames through the encoder: each once, and backgrounds where they differ from their frame."""
+
+from collections import deque
+
+import torch
+from torch.nn import functional
+
+from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
+from vestcl.models._norm import NotedStatistics
+from vestcl.models.config import EncoderConfig
+from vestcl.models.encoder import COARSEST, STRIDE, Encoder, reach, upsample_features
+from vestcl.models.skipping import Box, Skip, Tally, boxes
+from vestcl.scene.layers import LayerBatch
+
+#: Frames that are remembered: the next step's two inputs.
+_REMEMBERED = 2
+
+
+class Memory:
+    """The last frames that were encoded, for when they come again: as long as weights and settings stay the same."""
+
+    def __init__(self) -> None:
+        self._frames: deque[tuple[object, LayerBatch, EncodedFrame]] = deque(maxlen=_REMEMBERED)
+
+    def find(self, key: object, layers: LayerBatch) -> EncodedFrame | None:
+        """What ``layers`` were encoded to, if they are among the last."""
+        for known, seen, encoded in self._frames:
+            if known == key and all(map(_same, seen, layers)):
+                return encoded
+        return None
+
+    def keep(self, key: object, layers: LayerBatch, encoded: EncodedFrame) -> None:
+        """In place of the oldest."""
+        self._frames.append((key, layers, encoded))
+
+
+def version(encoder: Encoder) -> tuple[int, ...] | None:
+    """Differs after every change of the weights; None where that can't be told."""
+    parameters = list(encoder.parameters())
+    return None if any(p.is_inference() for p in parameters) else tuple(p._version for p in parameters)
+
+
+def encode(encoder: Encoder, config: EncoderConfig, layers: LayerBatch, skip: Skip, tally: Tally) -> EncodedFrame:
+    """Features of frames and of their backgrounds.
+
+    Args:
+        encoder: the network.
+        config: of it; says what a background is normalised by.
+        layers: of B frames.
+        skip: with ``background`` the background is encoded where it has to be.
+        tally: is told how much that left out.
+    """
+    if config.background == "own":
+        own, background = _apart(encoder, layers, tally)
+    else:
+        own, background = _borrowing(encoder, config, layers, skip, tally)
+    own, background = own.to(layers.image.dtype), background.to(layers.image.dtype)
+    return EncodedFrame(layers, upsample_features(own, *layers.image.shape[2:]), background, own is background)
+
+
+def _apart(encoder: Encoder, layers: LayerBatch, tally: Tally) -> tuple[torch.Tensor, torch.Tensor]:
+    """Frames and backgrounds in one pass; backgrounds without foreground in front are the frame itself."""
+    batch = len(layers.image)
+    has_foreground = (layers.mask < FOREGROUND_BELOW).flatten(1).any(dim=1)
+    grid = encoder(torch.cat([layers.image, layers.background_image[has_foreground]]))
+    tally.add("background", _pixels(layers, batch - int(has_foreground.sum())), _pixels(layers, batch), "px")
+    own = grid[:batch]
+    if not has_foreground.any():
+        return own, own
+    rows = torch.arange(batch)
+    rows[has_foreground] = torch.arange(batch, len(grid))
+    return own, grid.index_select(0, rows)
+
+
+def _borrowing(
+    encoder: Encoder, config: EncoderConfig, layers: LayerBatch, skip: Skip, tally: Tally
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Backgrounds by their frames' statistics, and their frames' features in cells where they are the frame."""
+    statistics = NotedStatistics()
+    own = encoder(layers.image, statistics.note)
+    differs = (layers.background_image != layers.image).any(dim=1, keepdim=True)
+    rows, total = differs.flatten(1).any(dim=1).nonzero()[:, 0], _pixels(layers, len(own))
+    if skip.background and not len(rows):
+        tally.add("background", total, total, "px")
+        return own, own
+    height, width = differs.shape[2:]
+    parts = [Box(0, height, 0, width)]
+    if skip.background:
+        margin = reach(config) if skip.margin is None else skip.margin
+        parts = boxes(differs.any(dim=0)[0], margin, COARSEST)
+    else:
+        rows = torch.arange(len(own))
+    cells = functional.max_pool2d(differs[rows].to(own.dtype), STRIDE, ceil_mode=True) > 0
+    background, some = own.clone(), own[rows]
+    for box in parts:
+        grid = encoder(box.cut(layers.background_image[rows]), statistics.borrowed(rows))
+        box.cut(some, STRIDE).copy_(torch.where(box.cut(cells, STRIDE), grid, box.cut(some, STRIDE)))
+    background[rows] = some
+    tally.add("background", total - len(rows) * sum(box.pixels for box in parts), total, "px")
+    return own, background
+
+
+def _pixels(layers: LayerBatch, frames: int) -> int:
+    return frames * layers.image.shape[2] * layers.image.shape[3]
+
+
+def _same(one: torch.Tensor, other: torch.Tensor) -> bool:
+    return one is other or (one.dtype == other.dtype and torch.equal(one, other))

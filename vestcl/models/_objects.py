@@ -1,0 +1,85 @@
+"""Object motion where there are objects."""
+
+from collections.abc import Iterable
+
+import torch
+
+from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
+from vestcl.models.config import LOG_DEPTH_FAR
+from vestcl.models.ego_motion import CameraMotion
+from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
+from vestcl.models.skipping import Box, Skip, Tally, boxes
+
+
+def unmoved(start: torch.Tensor) -> ObjectMotionForecast:
+    """``start`` [B, 6, H, W] m and no block that ran."""
+    return ObjectMotionForecast(start, [], torch.zeros(len(start), 0, dtype=torch.bool), None)
+
+
+def move_objects(
+    network: ObjectMotion,
+    prev: EncodedFrame,
+    cur: EncodedFrame,
+    to_next: CameraMotion,
+    flow0: torch.Tensor,
+    start: torch.Tensor,
+    skip: Skip,
+    tally: Tally,
+) -> ObjectMotionForecast:
+    """OMF at full size, [B, 6, H, W] m in and out.
+
+    The sky's rigid flow is hundreds of metres in any bend, which no convolution should see: with (R - I) x scaled
+    to a depth of LOG_DEPTH_FAR it is as far as the networks' depth goes. What was taken off is added again.
+
+    Args:
+        network: OMF.
+        prev: frame at t - 1.
+        cur: frame at t.
+        to_next: the camera's motion from both.
+        flow0: the rigid flow.
+        start: what OMF corrects.
+        skip: with ``objects``, OMF runs around the foreground, if it is to move nothing else.
+        tally: is told how much that left out.
+    """
+    moving = torch.cat([frame.layers.mask < FOREGROUND_BELOW for frame in (prev, cur)], dim=1)
+    found = _where(network, moving, skip, tally)
+    if not found:
+        return unmoved(start)
+    beyond = torch.cat([
+        (1 - LOG_DEPTH_FAR / frame.layers.depth).clamp(min=0) * (flow - rigid.translation[:, :, None, None])
+        for frame, rigid, flow in zip((prev, cur), to_next[:2], flow0.split(3, dim=1), strict=True)
+    ], dim=1)  # fmt: skip
+    near = start - beyond
+    seen = [
+        *(frame.features for frame in (prev, cur)),
+        *(frame.layers.depth for frame in (prev, cur)),
+        *(frame.layers.mask for frame in (prev, cur)),
+        near,
+    ]
+    parts = [network(*map(box.cut, seen)) for box in found]
+    moves = moving.repeat_interleave(3, dim=1) if network.config.where == "foreground" else None
+
+    def whole(pieces: Iterable[torch.Tensor]) -> torch.Tensor:
+        flow = near.clone()
+        for box, piece in zip(found, pieces, strict=True):
+            box.cut(flow).copy_(piece)
+        return flow + beyond if moves is None else torch.where(moves, flow + beyond, start)
+
+    candidates = [whole(pieces) for pieces in zip(*(part.candidates for part in parts), strict=True)]
+    return parts[0]._replace(flow=whole(part.flow for part in parts), candidates=candidates)
+
+
+def _where(network: ObjectMotion, moving: torch.Tensor, skip: Skip, tally: Tally) -> list[Box]:
+    """The parts of the picture that OMF is to see; one alone where it chooses its blocks by the whole scene."""
+    batch, _, height, width = moving.shape
+    whole = Box(0, height, 0, width)
+    if network.config.where == "everywhere" or not skip.objects:
+        return [whole]
+    margin = network.reach if skip.margin is None else skip.margin
+    found = boxes(moving.flatten(0, 1).any(dim=0), margin, network.multiple)
+    if network.routing is not None and found:
+        found = [found[0].around(found[1:])]
+    if not found and network.learns:
+        found = [Box(0, min(height, network.multiple), 0, min(width, network.multiple))]  # for a gradient of 0
+    tally.add("objects", batch * (whole.pixels - sum(box.pixels for box in found)), batch * whole.pixels, "px")
+    return found
