@@ -234,7 +234,7 @@ def test_refuses_arguments() -> None:
 
 
 def test_what_is_seen_is_never_hidden_by_what_is_inpainted() -> None:
-    """A car drives away from the road that was painted 1 % behind it: it stays in front, but where depth alone rules."""
+    """A car drives away from the road that was painted 1 % behind it: it stays in front unless depth alone rules."""
     red, green = torch.tensor([[1.0, 0, 0, 1.0]]), torch.tensor([[0, 1.0, 0, 1.0]])
     xyz, moved = torch.tensor([[0, 0, 10.0], [0, 0, 10.1]]), torch.tensor([[0, 0, 2.0], [0, 0, 0]])
     one, alone = torch.ones(2, 1), torch.arange(2)[:, None].expand(2, 4)
