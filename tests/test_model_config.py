@@ -40,7 +40,7 @@ def test_the_paper() -> None:
 def test_every_variant_changes_its_own_field() -> None:
     changed: dict[str, Callable[[ModelConfig], Any]] = {
         "fixed-depth": lambda c: c.fixed_depth == 20.0,
-        "no-emf": lambda c: c.ego_motion is None,
+        "no-emf": lambda c: c.ego_motion is None and c.object_motion.where == "everywhere",
         "no-omf": lambda c: c.object_motion is None,
         "features-only": lambda c: not c.render.colour and c.render.channels(32) == 64,
         "joint": lambda c: c.render.joint and c.render.channels(32) == 37,

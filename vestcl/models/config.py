@@ -3,7 +3,7 @@
     vest-paper              the paper's widths
     vest-s                  widths that two CPU cores train
     +fixed-depth            ablation A of the paper: every pixel at FIXED_DEPTH
-    +no-emf  +no-omf        ablations B and C: without ego-motion, without object motion
+    +no-emf  +no-omf        ablations B and C: without ego-motion (object motion moves all), without object motion
     +features-only          the paper's literal 32 rendered channels: features and nothing else
     +joint                  both clouds splatted together in one depth-ordered pass
     +residual               refinement adds to the splatted colour instead of painting anew
@@ -231,6 +231,12 @@ def _change_object_motion(config: ModelConfig, **fields: object) -> ModelConfig:
     return dataclasses.replace(config, object_motion=changed)
 
 
+def _without_ego_motion(config: ModelConfig) -> ModelConfig:
+    """Then object motion has to move everything."""
+    objects = config.object_motion and dataclasses.replace(config.object_motion, where="everywhere")
+    return dataclasses.replace(config, ego_motion=None, object_motion=objects)
+
+
 def _from_rest(config: ModelConfig) -> ModelConfig:
     camera = config.ego_motion and dataclasses.replace(config.ego_motion, path=1)
     return dataclasses.replace(config, ego_motion=camera, start="rest")
@@ -249,7 +255,7 @@ def _change_base(config: ModelConfig, base: Literal["none", "splatted", "filled"
 VARIANTS: Final[Mapping[str, Callable[[ModelConfig], ModelConfig]]] = MappingProxyType(
     {
         "fixed-depth": lambda c: dataclasses.replace(c, fixed_depth=FIXED_DEPTH),
-        "no-emf": lambda c: dataclasses.replace(c, ego_motion=None),
+        "no-emf": _without_ego_motion,
         "no-omf": lambda c: dataclasses.replace(c, object_motion=None),
         "features-only": lambda c: _without_colour(_change_base(c, "none")),
         "joint": lambda c: dataclasses.replace(c, render=dataclasses.replace(c.render, joint=True)),
