@@ -63,6 +63,8 @@ def test_every_variant_changes_its_own_field() -> None:
             }
             if variant == "from-rest":  # and no further than the next frame
                 assert different <= {"name", "start", "ego_motion"}
+            elif variant == "no-emf":  # object motion moves all
+                assert different <= {"name", "ego_motion", "object_motion"}
             elif variant in ("features-only", "residual", "filled", "painting"):  # what is rendered, what is added to
                 assert different <= {"name", "render", "refine"}
             else:
