@@ -17,17 +17,17 @@ typedef struct { int x0, y0, x1, y1; } box_t;
 typedef struct { key_bits key, id; } entry_t;
 
 // One entry of a sorted tile list. box holds the footprint inside the tile, see pack_box.
-typedef struct { REAL u, v, r, r2, slope, o; int box, id; } record_t;
+typedef struct { REAL u, v, r, o; int box, id; } record_t;
 
-// A footprint inside one tile, and whether it is the point's whole footprint.
-inline int pack_box(box_t box, bool whole) {
-  return box.x0 | box.x1 << 5 | box.y0 << 10 | box.y1 << 15 | (int)whole << 20;
+// A footprint inside one tile, and whether the tile is the first of the point's to be walked back, see first_box.
+inline int pack_box(box_t box, bool first) {
+  return box.x0 | box.x1 << 5 | box.y0 << 10 | box.y1 << 15 | (int)first << 20;
 }
 inline box_t unpack_box(int packed) {
   const box_t box = {packed & 31, packed >> 10 & 31, packed >> 5 & 31, packed >> 15 & 31};
   return box;
 }
-inline bool is_whole(int packed) { return packed >> 20 & 1; }
+inline bool is_first(int packed) { return packed >> 20 & 1; }
 
 // The indices of the pixels in [0, size) whose centres lie in (low, high) are [first_pixel(low), end_pixel(high)).
 inline int first_pixel(REAL low, int size) {
@@ -51,6 +51,27 @@ inline box_t footprint(REAL u, REAL v, REAL r, int height, int width) {
   return box;
 }
 
+// The backward takes the columns (and the rows) of tiles 0, step, 2 step, ..., then 1, step + 1, ..., and so on, and no
+// footprint covers more than `step`. So a column is the first that it takes of a footprint if it is one of the first
+// kind, or if the footprint begins in it and ends before the next of the first kind: if it lies in [x, y).
+inline int2 first_range(int column, int step) {
+  const int after = column % step;
+  return after == 0 ? (int2)(0, INT_MAX) : (int2)(column * TILE, (column - after + step) * TILE);
+}
+
+// The tile in that row and column is the first that the backward takes of the points whose footprint lies in this box.
+inline box_t first_box(int row, int column, int step_y, int step_x) {
+  const int2 x = first_range(column, step_x), y = first_range(row, step_y);
+  const box_t box = {x.x, y.x, x.y, y.y};
+  return box;
+}
+
+inline bool is_inside(box_t inner, box_t outer) {
+  return (inner.x0 >= outer.x0) & (inner.y0 >= outer.y0) & (inner.x1 <= outer.x1) & (inner.y1 <= outer.y1);
+}
+
+inline bool is_empty(box_t box) { return (box.x0 >= box.x1) | (box.y0 >= box.y1); }
+
 inline int area_of(box_t box) { return (box.x1 - box.x0) * (box.y1 - box.y0); }
 
 // Quads (2 x 2 pixels) that cover a footprint, from its first pixel on.
@@ -64,11 +85,11 @@ inline bool drawable(REAL u, REAL v, REAL z, REAL r, REAL o) {
 }
 
 // Where a point's fragments are, as a number: its first tile, and how many rows and columns of tiles it has more.
-// -1: nowhere. MANY stands for MANY and above; the footprint then tells.
+// -1: in no list. MANY stands for MANY and above; the footprint then tells.
 #define MORE_BITS 2
 #define MANY ((1 << MORE_BITS) - 1)
 inline int pack_place(int tile, int more_rows, int more_columns) {
   return tile << 2 * MORE_BITS | min(more_rows, MANY) << MORE_BITS | min(more_columns, MANY);
 }
 inline int first_tile(int place) { return place >> 2 * MORE_BITS; }
-inline bool is_in_one_tile(int place) { return place >= 0 && (place & ((1 << 2 * MORE_BITS) - 1)) == 0; }
+inline bool is_in_one_tile(int listed_place) { return (listed_place & ((1 << 2 * MORE_BITS) - 1)) == 0; }

@@ -41,6 +41,7 @@ kernel void count_tiles(
     global const REAL* restrict z,            // [P]
     global const REAL* restrict radii,        // [P]
     global const REAL* restrict opacities,    // [P]
+    const int list_transparent,               // 0: points of opacity 0 are left out
     global int* restrict places,              // [P] out: see pack_place
     global int* restrict counts,              // [B, chunks, tiles] out
     global int* restrict spans)               // [B, chunks] out: most tiles that a footprint covers along an axis
@@ -56,7 +57,8 @@ kernel void count_tiles(
     for (int i = strip; i < end; i++) {
       const REAL u = points_uv[2 * (size_t)i], v = points_uv[2 * (size_t)i + 1];
       const box_t box = footprint(u, v, radii[i], height, width);
-      const bool seen = drawable(u, v, z[i], radii[i], opacities[i]) & (box.x0 < box.x1) & (box.y0 < box.y1);
+      const bool seen = drawable(u, v, z[i], radii[i], opacities[i]) & !is_empty(box) &
+                        (list_transparent | (opacities[i] != 0));
       const int x = box.x0 / TILE, y = box.y0 / TILE;
       const int columns = (box.x1 - 1) / TILE - x, rows = (box.y1 - 1) / TILE - y;
       span = max(span, seen ? max(columns, rows) + 1 : 1);
@@ -65,6 +67,10 @@ kernel void count_tiles(
     for (int i = strip; i < end; i++) {
       const int place = places[i];
       if (place < 0) continue;
+      if (is_in_one_tile(place)) {
+        mine[first_tile(place)]++;
+        continue;
+      }
       const int2 more = more_tiles(place, i, height, width, points_uv, radii);
       for (int y = 0; y <= more.y; y++)
         for (int x = 0; x <= more.x; x++) mine[first_tile(place) + y * tiles_x + x]++;
@@ -110,6 +116,10 @@ kernel void fill_tiles(
     const int place = places[i];
     if (place < 0) continue;
     const entry_t entry = {AS_KEY(z[i]), i};
+    if (is_in_one_tile(place)) {
+      entries[next[first_tile(place)]++] = entry;
+      continue;
+    }
     const int2 more = more_tiles(place, i, height, width, points_uv, radii);
     for (int y = 0; y <= more.y; y++)
       for (int x = 0; x <= more.x; x++) entries[next[first_tile(place) + y * tiles_x + x]++] = entry;
@@ -118,19 +128,17 @@ kernel void fill_tiles(
 
 // What compositing needs of point id in the tile at (top, left).
 inline record_t record_of(
-    size_t id, int top, int left, int height, int width, global const REAL* points_uv, global const REAL* radii,
-    global const REAL* opacities) {
+    size_t id, int top, int left, int height, int width, box_t firsts, global const REAL* points_uv,
+    global const REAL* radii, global const REAL* opacities) {
   record_t record;
   record.u = points_uv[2 * id];
   record.v = points_uv[2 * id + 1];
   record.r = radii[id];
   record.o = opacities[id];
-  record.r2 = record.r * record.r;
-  record.slope = record.o / record.r2;
   record.id = id;
   const box_t box = footprint(record.u, record.v, record.r, height, width);
   const box_t inside = {max(box.x0 - left, 0), max(box.y0 - top, 0), min(box.x1 - left, TILE), min(box.y1 - top, TILE)};
-  record.box = pack_box(inside, area_of(inside) == area_of(box));
+  record.box = pack_box(inside, is_inside(box, firsts));
   return record;
 }
 
@@ -185,6 +193,7 @@ inline void sort_list(global entry_t* a, global entry_t* room, int n) {
 // One work-item a tile.
 kernel void sort_tiles(
     const int height, const int width, const int tiles_y, const int tiles_x,
+    const int step_y, const int step_x,  // of the backward, see first_box
     global const int* restrict tile_starts,   // [B * tiles + 1]
     global const REAL* restrict points_uv,    // [P, 2]
     global const REAL* restrict radii,        // [P]
@@ -204,9 +213,10 @@ kernel void sort_tiles(
     PREFETCH(opacities + id);
   }
   sort_list(entries + begin, room + begin, n);
+  const box_t firsts = first_box(top / TILE, left / TILE, step_y, step_x);
   long slots = 0;
   for (int i = begin; i < begin + n; i++) {
-    const record_t record = record_of(entries[i].id, top, left, height, width, points_uv, radii, opacities);
+    const record_t record = record_of(entries[i].id, top, left, height, width, firsts, points_uv, radii, opacities);
     records[i] = record;
     slots += 4 * quads_in(unpack_box(record.box));
   }
@@ -229,6 +239,7 @@ inline int rank_in(global const entry_t* a, int n, key_bits key, bool equal_too)
 // The same lists by one work-group a tile, for GPUs: merge sort, where each entry finds its rank in the other half.
 kernel void sort_tiles_together(
     const int height, const int width, const int tiles_y, const int tiles_x,
+    const int step_y, const int step_x,  // of the backward, see first_box
     global const int* restrict tile_starts,                    // [B * tiles + 1]
     global const REAL* restrict points_uv,                     // [P, 2]
     global const REAL* restrict radii,                         // [P]
@@ -260,9 +271,10 @@ kernel void sort_tiles_together(
   const int top = t % tiles / tiles_x * TILE, left = t % tiles_x * TILE;
   const int share = (n + GROUP - 1) / GROUP;
   const int first = min(lane * share, n), stop = min(first + share, n);
+  const box_t firsts = first_box(top / TILE, left / TILE, step_y, step_x);
   long slots = 0;
   for (int i = first; i < stop; i++) {
-    const record_t record = record_of(a[i].id, top, left, height, width, points_uv, radii, opacities);
+    const record_t record = record_of(a[i].id, top, left, height, width, firsts, points_uv, radii, opacities);
     records[begin + i] = record;
     slot_starts[begin + i] = slots;
     slots += area_of(unpack_box(record.box));

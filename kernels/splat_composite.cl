@@ -19,17 +19,10 @@
 #include "channels.h"
 #include "splat_gradients.h"
 #include "tile.h"
+#include "splat_walk.h"
 
-// Points read ahead of their turn.
-#define AHEAD 24
 // Entries between two looks whether every pixel of the tile is opaque.
 #define LOOK_EVERY 256
-
-inline void read_ahead(global const record_t* records, int e, global const REAL* features) {
-  global const REAL* row = features + (size_t)records[e].id * CHANNELS;
-#pragma unroll
-  for (int c = 0; c < CHANNELS; c += CACHE_LINE / sizeof(REAL)) PREFETCH(row + c);
-}
 
 kernel void composite_tiles(
     const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
@@ -39,7 +32,7 @@ kernel void composite_tiles(
     global const REAL* restrict backgrounds,  // [B, C]
     global REAL* restrict image,              // [B, H, W, C] out
     global REAL* restrict coverage,           // [B, H, W] out
-    global int* restrict tile_finite)         // [B * tiles] out: whether all features are known to be finite
+    global int* restrict tile_walked)         // [B * tiles] out: see pack_walked
 {
   const int index = get_global_id(0);
   const tile_t tile = tile_at(index, height, width, tiles_y, tiles_x);
@@ -51,10 +44,11 @@ kernel void composite_tiles(
     for (int k = 0; k < BLOCKS; k++) sums[p][k] = 0;
   }
 
-  const int begin = tile_starts[index], end = tile_starts[index + 1];
+  const int begin = tile_starts[index], last = tile_starts[get_global_size(0)] - 1;
+  int end = tile_starts[index + 1];
   bool finite = true;
   for (int e = begin; e < end; e++) {
-    read_ahead(records, min(e + AHEAD, end - 1), features);
+    read_ahead(records, min(e + AHEAD, last), features);  // across the end, into the list of the next tile
     global const record_t* point = records + e;
     vector_t f[BLOCKS];
     if (!load_row(features + (size_t)point->id * CHANNELS, f)) {
@@ -78,12 +72,15 @@ kernel void composite_tiles(
           sums[p + STRIDE + 1][k] += w.w * f[k];
         }
       }
-    if ((e - begin) % LOOK_EVERY == LOOK_EVERY - 1 && is_opaque(transmittance, tile, min_transmittance)) {
-      finite = false;  // nobody has looked at the rest
-      break;
-    }
+    if ((e - begin) % LOOK_EVERY == LOOK_EVERY - 1 && is_opaque(transmittance, tile, min_transmittance)) end = e + 1;
   }
-  tile_finite[index] = finite;
+#if TRUNCATE
+  tile_walked[index] = pack_walked(end - begin, finite);
+#else
+  // What lies behind the fragment that made a pixel opaque shows in that fragment's gradient: the backward walks all.
+  const int entries = tile_starts[index + 1] - begin;
+  tile_walked[index] = pack_walked(entries, finite && entries == end - begin);
+#endif
 
   vector_t background[BLOCKS];
   copy_row(backgrounds + (size_t)tile.b * CHANNELS, background);
@@ -99,41 +96,6 @@ kernel void composite_tiles(
 }
 
 #ifdef GRAD_FEATURES
-// What the backward keeps of one segment, quad by quad, and of the tile's pixels.
-typedef struct { REAL4 alpha, before; } quad_t;  // a_i and T_i, 0 and 0 where there is no fragment
-typedef struct {
-  quad_t quads[SEGMENT / 4];
-  REAL transmittance[ROOM];
-} walk_t;
-
-// Walk forward from entry e until the segment is full or the list ends; returns the entry after the last.
-inline int walk_forward(
-    walk_t* walk, int e, int end, bool all_finite, tile_t tile, REAL min_transmittance,
-    global const record_t* records, global const REAL* features) {
-  for (int slot = 0; e < end; e++) {
-    global const record_t* point = records + e;
-    const box_t box = unpack_box(point->box);
-    if (slot + quads_in(box) > SEGMENT / 4) break;
-    bool finite = true;
-    if (!all_finite) {
-      vector_t f[BLOCKS];
-      finite = load_row(features + (size_t)point->id * CHANNELS, f);
-    }
-    disc_t disc = disc_of(point, tile);
-    if (!finite) disc.r2 = 0;
-    for (int y = box.y0; y < box.y1; y += 2)
-      for (int x = box.x0; x < box.x1; x += 2, slot++) {
-        const int p = y * STRIDE + x;
-        const REAL4 t = load_quad(walk->transmittance, p);
-        quad_t quad;
-        quad.alpha = quad_alphas(disc, x, y, t, min_transmittance, &quad.before);
-        walk->quads[slot] = quad;
-        store_quad(t * (1 - quad.alpha), walk->transmittance, p);
-      }
-  }
-  return e;
-}
-
 // What lies behind the last fragment of every pixel: A_end = b.g - h.
 inline void look_behind(
     const vector_t g[ROOM][BLOCKS], tile_t tile, int height, int width, global const REAL* background_row,
@@ -172,21 +134,40 @@ inline void sum_background(
   store_row(total, grad_row);
 }
 
+// Entries [e, end) make no fragments here, for all pixels stopped before them: they have no gradient.
+inline void clear_hidden(
+    global const record_t* records, int e, int end, global REAL* grad_features, global REAL* grad_points_uv,
+    global REAL* grad_radii, global REAL* grad_opacities) {
+  const point_grads_t none = {0, 0, 0, 0};
+  for (; e < end; e++) {
+    if (!is_first(records[e].box)) continue;
+    const size_t id = records[e].id;
+#if GRAD_FEATURES
+    clear_row(grad_features + id * CHANNELS);
+#endif
+    write_scalars(none, id, true, grad_points_uv, grad_radii, grad_opacities);
+  }
+}
+
 // Walk a segment's entries back to front, writing or adding to their points' gradients.
 inline void walk_back(
-    const walk_t* walk, const vector_t g[ROOM][BLOCKS], REAL* behind, int first, int stop, tile_t tile,
-    global const record_t* records, global const REAL* features, global REAL* grad_features,
+    const walk_t* walk, const vector_t g[ROOM][BLOCKS], REAL* behind, int first, int stop, bool known_finite,
+    tile_t tile, global const record_t* records, global const REAL* features, global REAL* grad_features,
     global REAL* grad_points_uv, global REAL* grad_radii, global REAL* grad_opacities) {
   int slot = 0;
   for (int e = first; e < stop; e++) slot += quads_in(unpack_box(records[e].box));
   for (int e = stop - 1; e >= first; e--) {
-    read_ahead(records, max(e - AHEAD, first), features);
+    const int next = max(e - AHEAD, first);
+    read_ahead(records, next, features);
+    write_ahead(records, next, grad_features, grad_points_uv, grad_radii, grad_opacities);
     global const record_t* point = records + e;
     const int id = point->id;
     const box_t box = unpack_box(point->box);
     const disc_t disc = disc_of(point, tile);
     vector_t f[BLOCKS], grad_f[BLOCKS];
-    const bool finite = load_row(features + (size_t)id * CHANNELS, f);
+    bool finite = true;
+    if (known_finite) copy_row(features + (size_t)id * CHANNELS, f);
+    else finite = load_row(features + (size_t)id * CHANNELS, f);
 #pragma unroll
     for (int k = 0; k < BLOCKS; k++) {
       grad_f[k] = 0;
@@ -223,24 +204,24 @@ inline void walk_back(
           grad_f[k] += w.x * g[p][k] + w.y * g[p + 1][k] + w.z * g[p + STRIDE][k] + w.w * g[p + STRIDE + 1][k];
 #endif
       }
-    const bool whole = is_whole(point->box);
+    const bool first_tile = is_first(point->box);
 #if GRAD_FEATURES
     global REAL* row = grad_features + (size_t)id * CHANNELS;
-    if (!whole) add_row(grad_f, row);
-    else stream_row(grad_f, row);
+    if (first_tile) stream_row(grad_f, row);
+    else add_row(grad_f, row);
 #endif
 #if GRAD_GEOMETRY
-    const REAL slope = 2 * point->slope, d2 = sum_of_four(sum_d2);
+    const REAL slope = 2 * disc.slope, d2 = sum_of_four(sum_d2);
     const point_grads_t grads = {
         slope * sum_of_four(sum_dx), slope * sum_of_four(sum_dy), slope * d2 / point->r,
-        sum_of_four(sum_da) - d2 / point->r2};
-    write_scalars(grads, id, whole, grad_points_uv, grad_radii, grad_opacities);
+        sum_of_four(sum_da) - d2 / disc.r2};
+    write_scalars(grads, id, first_tile, grad_points_uv, grad_radii, grad_opacities);
 #endif
   }
 }
 
 // Kernel for the tiles (x0 + i * step_x, y0 + j * step_y): no two of them share a point, so each adds to the
-// gradients of its points alone. Rows of points that lie in one tile only are written, the others were cleared.
+// gradients of its points alone: the first tile that has a point writes, the others add.
 kernel void composite_tiles_backward(
     const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
     const int x0, const int y0, const int step_x, const int step_y,
@@ -249,7 +230,7 @@ kernel void composite_tiles_backward(
     global const record_t* restrict records,        // [E]
     global const REAL* restrict features,           // [P, C]
     global const REAL* restrict backgrounds,        // [B, C]
-    global const int* restrict tile_finite,         // [B * tiles]
+    global const int* restrict tile_walked,         // [B * tiles] from the forward
     global const REAL* restrict grad_image,         // [B, C, H, W] by strides
     global const REAL* restrict grad_coverage,      // [B, H, W]
     global const int* restrict checkpoint_starts,   // [B * tiles]
@@ -264,26 +245,29 @@ kernel void composite_tiles_backward(
   const int tx = x0 + (int)get_global_id(0) * step_x, ty = y0 + (int)get_global_id(1) * step_y;
   const int index = ((int)get_global_id(2) * tiles_y + ty) * tiles_x + tx;
   const tile_t tile = tile_at(index, height, width, tiles_y, tiles_x);
-  const int begin = tile_starts[index], end = tile_starts[index + 1];
-  const bool finite = tile_finite[index];
+  const int begin = tile_starts[index], end = begin + entries_walked(tile_walked[index]);
+  const bool finite = all_finite(tile_walked[index]);
+  clear_hidden(records, end, tile_starts[index + 1], grad_features, grad_points_uv, grad_radii, grad_opacities);
 #if !GRAD_BACKGROUNDS
   if (begin == end) return;
 #endif
-  vector_t g[ROOM][BLOCKS];
-  load_grad_image(g, tile, height, width, pixel_stride, channel_stride, grad_image);
 
   // Forward, keeping the first transmittances of every segment but the first.
+  gradient_ahead_t ahead = gradient_ahead(tile, height, width, channel_stride, grad_image);
   walk_t walk;
   for (int p = 0; p < ROOM; p++) walk.transmittance[p] = 1;
   int segment = 0, first = begin;
-  int stop = walk_forward(&walk, begin, end, finite, tile, min_transmittance, records, features);
+  int stop = walk_forward(&walk, begin, end, finite, tile, min_transmittance, records, features, &ahead);
   while (stop < end) {
     const int at = checkpoint_starts[index] + ++segment;
     checkpoint_entries[at] = first = stop;
     for (int p = 0; p < ROOM; p++) checkpoints[(size_t)at * ROOM + p] = walk.transmittance[p];
-    stop = walk_forward(&walk, first, end, finite, tile, min_transmittance, records, features);
+    stop = walk_forward(&walk, first, end, finite, tile, min_transmittance, records, features, &ahead);
   }
 
+  for (int e = max(stop - AHEAD, first); e < stop; e++) read_ahead(records, e, features);
+  vector_t g[ROOM][BLOCKS];
+  load_grad_image(g, tile, height, width, pixel_stride, channel_stride, grad_image);
 #if GRAD_BACKGROUNDS
   sum_background(g, walk.transmittance, tile, tile_grad_backgrounds + (size_t)index * CHANNELS);
 #endif
@@ -293,13 +277,13 @@ kernel void composite_tiles_backward(
   look_behind(g, tile, height, width, backgrounds + (size_t)tile.b * CHANNELS, grad_coverage, behind);
   for (;;) {
     walk_back(
-        &walk, g, behind, first, stop, tile, records, features, grad_features, grad_points_uv, grad_radii,
+        &walk, g, behind, first, stop, finite, tile, records, features, grad_features, grad_points_uv, grad_radii,
         grad_opacities);
     if (segment == 0) break;
     const int at = checkpoint_starts[index] + --segment;
     first = segment == 0 ? begin : checkpoint_entries[at];
     for (int p = 0; p < ROOM; p++) walk.transmittance[p] = segment == 0 ? (REAL)1 : checkpoints[(size_t)at * ROOM + p];
-    stop = walk_forward(&walk, first, end, finite, tile, min_transmittance, records, features);
+    stop = walk_forward(&walk, first, end, finite, tile, min_transmittance, records, features, &ahead);
   }
 }
 #endif

@@ -44,12 +44,12 @@ kernel void find_finite(const int points, global const REAL* restrict features, 
   finite[i] = zero == 0;
 }
 
-// The group copies entries [e, e + GROUP) of its list; those that make no fragment get r2 = 0.
+// The group copies entries [e, e + GROUP) of its list; those that make no fragment get r = 0.
 inline void stage(
     local record_t* staged, int lane, int e, int end, global const record_t* records, global const int* finite) {
   if (e + lane < end) {
     record_t record = records[e + lane];
-    if (!finite[record.id]) record.r2 = 0;
+    if (!finite[record.id]) record.r = 0;
     staged[lane] = record;
   }
 }
@@ -80,8 +80,9 @@ kernel void composite_pixels(
     const int count = min(GROUP, end - e);
     for (int i = 0; i < count; i++) {
       const REAL dx = x + (REAL)0.5 - staged[i].u, dy = y + (REAL)0.5 - staged[i].v, d2 = dx * dx + dy * dy;
-      if (!EXISTS(d2, staged[i].r2, t)) continue;
-      const REAL a = staged[i].o - staged[i].slope * d2, w = a * t;
+      const REAL r2 = staged[i].r * staged[i].r;
+      if (!EXISTS(d2, r2, t) || t == 0) continue;
+      const REAL a = staged[i].o - staged[i].o / r2 * d2, w = a * t;
       global const REAL* row = features + (size_t)staged[i].id * CHANNELS + first;
       for (int c = 0; c < channels; c++) sums[c] += w * row[c];
       t *= 1 - a;
@@ -126,8 +127,9 @@ kernel void composite_pixels_backward(
     const box_t box = unpack_box(records[e].box);
     if (column < box.x0 || column >= box.x1 || line < box.y0 || line >= box.y1) continue;
     const REAL dx = x + (REAL)0.5 - records[e].u, dy = y + (REAL)0.5 - records[e].v, d2 = dx * dx + dy * dy;
-    const bool exists = EXISTS(d2, records[e].r2, t) && finite[records[e].id];
-    const REAL a = exists ? records[e].o - records[e].slope * d2 : (REAL)0;
+    const REAL r2 = records[e].r * records[e].r;
+    const bool exists = EXISTS(d2, r2, t) && finite[records[e].id];
+    const REAL a = exists ? records[e].o - records[e].o / r2 * d2 : (REAL)0;
     const size_t slot = tile_slot_starts[index] + slot_starts[e] + slot_in(box, column, line);
     slot_weights[slot] = exists ? t : (REAL)0;
     slot_grads[slot] = a;
@@ -182,7 +184,7 @@ kernel void sum_slots(
   for (int e = tile_starts[index] + lane; e < tile_starts[index + 1]; e += GROUP) {
     const record_t point = records[e];
     const box_t box = unpack_box(point.box);
-    const bool whole = is_whole(point.box);
+    const bool first = is_first(point.box);
     const size_t slots = tile_slot_starts[index] + slot_starts[e];
     global const REAL* g = grad_image + (long)b * height * width * CHANNELS + ((long)top * width + left) * pixel_stride;
 #if GRAD_FEATURES
@@ -194,7 +196,7 @@ kernel void sum_slots(
           sum += slot_weights[slots + slot_in(box, x, y)] * g[pixel + c * channel_stride];
         }
       const size_t at = (size_t)point.id * CHANNELS + c;
-      grad_features[at] = (whole ? (REAL)0 : grad_features[at]) + sum;
+      grad_features[at] = (first ? (REAL)0 : grad_features[at]) + sum;
     }
 #endif
 #if GRAD_GEOMETRY
@@ -208,10 +210,9 @@ kernel void sum_slots(
         sum_dy += da * dy;
         sum_d2 += da * (dx * dx + dy * dy);
       }
-    const point_grads_t grads = {
-        2 * point.slope * sum_dx, 2 * point.slope * sum_dy, 2 * point.slope * sum_d2 / point.r,
-        sum_da - sum_d2 / point.r2};
-    write_scalars(grads, point.id, whole, grad_points_uv, grad_radii, grad_opacities);
+    const REAL r2 = point.r * point.r, slope = 2 * (point.o / r2);
+    const point_grads_t grads = {slope * sum_dx, slope * sum_dy, slope * sum_d2 / point.r, sum_da - sum_d2 / r2};
+    write_scalars(grads, point.id, first, grad_points_uv, grad_radii, grad_opacities);
 #endif
   }
 }

@@ -22,7 +22,7 @@ inline void write_scalars(
 #endif
 }
 
-// One work-item a chunk of points: the gradients that no tile writes outright become 0.
+// One work-item a chunk of points: the gradients of points that are in no tile become 0.
 kernel void clear_gradients(
     const int points,
     global const int* restrict places,   // [P], see splat_bin.cl
@@ -33,7 +33,7 @@ kernel void clear_gradients(
   const int begin = (long)points * c / chunks, end = (long)points * (c + 1) / chunks;
   const point_grads_t none = {0, 0, 0, 0};
   for (int i = begin; i < end; i++) {
-    if (is_in_one_tile(places[i])) continue;
+    if (places[i] >= 0) continue;
 #if GRAD_FEATURES
     clear_row(grad_features + (size_t)i * CHANNELS);
 #endif

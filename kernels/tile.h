@@ -41,9 +41,10 @@ inline bool is_opaque(const REAL* transmittance, tile_t tile, REAL min_transmitt
 typedef struct { REAL4 u, v; REAL r2, slope, o; } disc_t;
 
 inline disc_t disc_of(global const record_t* point, tile_t tile) {
+  const REAL r2 = point->r * point->r;
   const disc_t disc = {
       point->u - tile.left - (REAL)0.5 - (REAL4)(0, 1, 0, 1), point->v - tile.top - (REAL)0.5 - (REAL4)(0, 0, 1, 1),
-      point->r2, point->slope, point->o};
+      r2, point->o / r2, point->o};
   return disc;
 }
 

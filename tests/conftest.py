@@ -32,6 +32,14 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
+@pytest.fixture(autouse=True)
+def _devices_are_given_back() -> Iterator[None]:
+    """What a test leaves in use, the next one would run on."""
+    before = runtime._selected.get()
+    yield
+    assert runtime._selected.get() is before, "the test left another device in use"
+
+
 @pytest.fixture(params=[info.index for info in _devices()])
 def session(request: pytest.FixtureRequest) -> Iterator[runtime.Session]:
     """Each device under test, with the mapping that suits it."""

@@ -11,7 +11,7 @@ import torch
 from tolerances import assert_close
 
 from vestcl import reference
-from vestcl.bench import _fragments, _kernels, _measure, _peers, _scenes, _timing, splat
+from vestcl.bench import _fragments, _measure, _peers, _scenes, _timing, splat
 
 #: Nothing runs longer than its least number of rounds.
 TINY: dict[str, Any] = {"height": 24, "width": 50, "seconds": 1e-3, "compile": False}
@@ -51,11 +51,13 @@ def test_a_run_writes_and_prints_everything(
     path = tmp_path / "new folder" / "splat.json"
     splat.main(splat.SplatBench(**TINY, scaling=True, channels=True, json=path))
     assert [file.name for file in path.parent.iterdir()] == ["splat.json"]
-    results, printed = json.loads(path.read_text(encoding="utf-8")), capsys.readouterr().out
+    content, printed = json.loads(path.read_text(encoding="utf-8")), capsys.readouterr().out
+    (device,) = content["devices"]
+    results = device["details"]
     assert {"vestcl", "torch", "numpy", "pyopencl", "device", "driver", "processor", "cores", "date"} <= set(
-        results["machine"]
+        device["machine"]
     )
-    assert results["config"]["radii"] == [1.0, 2.0]
+    assert device["config"]["radii"] == [1.0, 2.0]
     assert [speed["facts"]["radius"] for speed in results["speed"]] == [1.0, 2.0]
     for speed in results["speed"] + results["scaling"] + results["channels"]:
         assert speed["facts"]["points"] == speed["facts"]["height"] * speed["facts"]["width"]
@@ -146,11 +148,6 @@ def test_facts(scene: _scenes.Scene) -> None:
     assert facts.most_layers == int(hits.sum(0).max())
     assert facts.points == 24 * 50
     assert int(hits.any(1).sum()) <= facts.shown_points <= facts.points
-    tile = (centres // 16).long()
-    tile_of = (tile[..., 0] + 100 * tile[..., 1]).expand(hits.shape)
-    first = torch.where(hits, tile_of, 10**6).min(1).values
-    last = torch.where(hits, tile_of, -1).max(1).values
-    assert int(_kernels._in_one_tile(scene)[0].sum()) <= int((first == last).sum())
 
 
 def test_tasks_take_turns_without_garbage_collection() -> None:

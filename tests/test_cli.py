@@ -2,8 +2,9 @@
 
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args, get_type_hints
 
 import pytest
@@ -117,6 +118,57 @@ def test_a_bench_does_not_need_the_others(monkeypatch: pytest.MonkeyPatch) -> No
     put_module(monkeypatch, "vestcl.bench.network", NetworkBench=NetworkBench, main=configs.append)
     assert cli.main(["bench", "network", "--width", "9"]) == 0
     assert configs == [NetworkBench(9)]
+
+
+def test_a_broken_bench_stands_in_nobodys_way(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of the list of all benches it is left out, and it says what is wrong when it is asked for."""
+
+    @dataclass(frozen=True)
+    class SplatBench:
+        """Time splat."""
+
+    def broken(path: str) -> object:
+        if path == "vestcl.bench.splat":
+            return SimpleNamespace(SplatBench=SplatBench)
+        if path == "vestcl.bench.pareto":
+            return SimpleNamespace()
+        if path == "vestcl.bench.operators":
+            raise ModuleNotFoundError("No module named 'abacus'", name="abacus")
+        raise ModuleNotFoundError(path, name=path)
+
+    monkeypatch.setattr(cli, "import_module", broken)
+    with pytest.raises(SystemExit):
+        cli.main(["bench", "--help"])
+    out, err = capsys.readouterr()
+    assert "Time splat" in out
+    told = err.splitlines()
+    assert len(told) == 2 and "operators is left out" in told[0] and "abacus" in told[0] and "pareto" in told[1]
+    with pytest.raises(AttributeError, match="ParetoBench"):
+        cli.main(["bench", "pareto"])
+
+
+def test_a_bench_with_a_hyphen_and_an_exit_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass(frozen=True)
+    class TrainStepBench:
+        """Time a training step."""
+
+        code: int = 1
+
+    put_module(monkeypatch, "vestcl.bench")
+    put_module(monkeypatch, "vestcl.bench.train_step", TrainStepBench=TrainStepBench, main=lambda config: config.code)
+    assert cli.main(["bench", "train-step"]) == 1
+    assert cli.main(["bench", "train-step", "--code", "0"]) == 0
+
+
+def test_every_bench_that_there_is_has_its_settings() -> None:
+    folder = Path(cli.__file__).parent / "bench"
+    there = {file.stem.replace("_", "-") for file in folder.glob("[!_]*.py")}
+    assert there <= set(cli._BENCHES)
+    found = cli._benches(sorted(there), asked=True)
+    assert set(found) == there
+    assert all(callable(module.main) and is_dataclass(kind) for module, kind in found.values())
 
 
 def test_a_bench_that_lacks_a_package_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

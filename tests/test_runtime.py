@@ -233,6 +233,68 @@ def test_profile_times_every_kernel(kernels: Path, fresh: runtime.Session) -> No
     assert all(0 < time.start_ns <= time.end_ns for time in times)
 
 
+def test_an_observer_hears_of_every_outermost_job(kernels: Path, fresh: runtime.Session) -> None:
+    array, heard = np.ones(10_000, np.float32), []
+    scale(fresh, 1, array)
+    before = time.perf_counter_ns()
+    with runtime.observe(heard.append):
+        scale(fresh, 2, array)
+        with fresh.job(), fresh.profile() as times:
+            scale(fresh, 3, array)
+            scale(fresh, 4, array)
+    after = time.perf_counter_ns()
+    scale(fresh, 5, array)
+    assert [[launch.name for launch in job.launches] for job in heard] == [["scale"], ["scale", "scale"]]
+    assert [time.name for time in times] == ["scale", "scale"], "a profile inside sees what the observer sees"
+    low, high = fresh.clock_bounds()
+    for job in heard:
+        assert job.session is fresh and before < job.start_ns < job.end_ns < after
+        for launch in job.launches:
+            assert job.start_ns < launch.enqueued_ns < job.end_ns
+            assert launch.queued_ns <= launch.submitted_ns <= launch.start_ns < launch.end_ns
+            assert job.start_ns <= launch.start_ns - low and launch.end_ns - high <= job.end_ns
+
+
+def test_an_observer_is_told_the_rest_when_a_job_fails(kernels: Path, fresh: runtime.Session) -> None:
+    heard: list[runtime.JobTimes] = []
+    with runtime.observe(heard.append):
+        test_a_failed_job_frees_the_session(kernels, fresh)
+    assert [len(job.launches) for job in heard] == [1]
+
+
+def test_one_observer_at_a_time(kernels: Path, fresh: runtime.Session) -> None:
+    heard: list[runtime.JobTimes] = []
+    with runtime.observe(heard.append):
+        with pytest.raises(ValueError, match="`observer` must be the only one"), runtime.observe(print):
+            pass
+        scale(fresh, 2, np.ones(4, np.float32))
+    assert len(heard) == 1
+
+
+def test_clock_bounds_hold_the_devices_clock(fresh: runtime.Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a device without a call for its clock, and of one with it, which is a made-up one."""
+    low, high = fresh.clock_bounds()
+    assert 0 <= high - low < 10**9
+
+    class Clock:
+        def device_and_host_timer(self) -> tuple[int, int]:
+            return time.perf_counter_ns() + 10**12, 0
+
+    monkeypatch.setattr(fresh, "_device", Clock())
+    low, high = fresh.clock_bounds()
+    assert low <= 10**12 <= high < low + 10**9
+
+
+def test_a_profile_inside_a_job(kernels: Path, fresh: runtime.Session) -> None:
+    array = np.ones(10_000, np.float32)
+    with fresh.job():
+        with fresh.profile() as times:
+            result = scale(fresh, 2, array)
+        again = scale(fresh, 3, array)
+    assert [time.name for time in times] == ["scale"]
+    assert result[0] == 2 and again[0] == 3
+
+
 def test_a_session_counts_the_seconds_of_its_jobs(kernels: Path, fresh: runtime.Session) -> None:
     """From a job's first argument to its last result, once where one job is inside another."""
     assert fresh.seconds == 0

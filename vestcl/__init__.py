@@ -8,7 +8,7 @@ from vestcl.runtime import DeviceError, DeviceInfo, devices, use
 if TYPE_CHECKING:  # the others load on first use, for importing torch takes seconds
     from vestcl.ops.displace import displace
     from vestcl.ops.rigid_flow import rigid_flow
-    from vestcl.ops.splat import Raster, composite, rasterize, splat
+    from vestcl.ops.splat import Raster, Skipped, composite, rasterize, skipped, splat
     from vestcl.ops.unproject import unproject
 
 __version__ = "0.1.0"
@@ -16,17 +16,20 @@ __all__ = [
     "DeviceError",
     "DeviceInfo",
     "Raster",
+    "Skipped",
     "composite",
     "devices",
     "displace",
     "rasterize",
     "rigid_flow",
+    "skipped",
     "splat",
     "unproject",
     "use",
 ]
 
-_FILES = {"Raster": "splat", "composite": "splat", "rasterize": "splat"}  # others are in the file of their own name
+# others are in the file of their own name
+_FILES = dict.fromkeys(("Raster", "Skipped", "composite", "rasterize", "skipped"), "splat")
 
 
 def __getattr__(name: str) -> Any:

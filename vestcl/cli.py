@@ -1,7 +1,7 @@
 """The command line: `vestcl forecast`, `prepare`, `devices`, `doctor`, `demo`, `bench`. Torch is imported late."""
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -16,13 +16,11 @@ from rich.text import Text
 
 from vestcl import __version__, doctor, runtime
 
-#: Module of vestcl.bench -> its settings; each has a ``main`` that takes them.
-_BENCHES: Final = {
-    "splat": "SplatBench",
-    "network": "NetworkBench",
-    "inpaint": "InpaintBench",
-    "forecast": "ForecastBench",
-}
+#: `vestcl bench train-step` is vestcl.bench.train_step; its ``main`` takes a TrainStepBench, may return an exit code.
+_BENCHES: Final = (
+    *("splat", "operators", "pipeline", "train-step", "network"),
+    *("pareto", "stability", "inpaint", "forecast", "compare"),
+)
 
 
 @dataclass(frozen=True)
@@ -125,6 +123,8 @@ class Forecast:
     """Forecast by a network: vest-s, a .safetensors file, a training checkpoint's folder. Without it: by geometry."""
     mode: Literal["compose", "feedback"] | None = None
     """With --model: repeat the first step's motion (compose, which is usual), or see each forecast frame (feedback)."""
+    quality: Literal["exact", "balanced", "fast"] | None = None
+    """With --model: balanced (usual) is within 0.1 dB of exact in PSNR, fast not; docs/time_against_error has both."""
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Where to look from: source, right, left, or x,y,z[,yaw=][,pitch=][,roll=][,fov=][,name=], as in
     "0.5,0,0,yaw=-5": metres to the right of, below and ahead of the source camera, and degrees to the right, up and
@@ -238,7 +238,7 @@ class Prepare:
 
 @dataclass(frozen=True)
 class Bench:
-    """Time a part of vestcl: `vestcl bench splat`, `network`, `inpaint` or `forecast`."""
+    """Measure a part of vestcl, `vestcl bench splat` for one; `vestcl bench --help` lists all."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -276,23 +276,27 @@ def _command(arguments: Sequence[str]) -> int:
 
 def _bench(arguments: Sequence[str]) -> int:
     """Import the bench that is asked for and no other, so that one which can't be imported stands in nobody's way."""
-    asked = [name for name in _BENCHES if arguments[:1] == [name]]
-    modules = _bench_modules(asked) or _bench_modules(_BENCHES)
-    configs = {name: getattr(module, _BENCHES[name]) for name, module in modules.items()}
+    benches = _benches(sorted({*arguments[:1]} & {*_BENCHES}), asked=True) or _benches(_BENCHES, asked=False)
+    configs: dict[str, Callable[..., Any]] = {name: kind for name, (_, kind) in benches.items()}
     config = tyro.extras.subcommand_cli_from_dict(configs, prog="vestcl bench", args=arguments)
-    chosen = next(name for name, kind in configs.items() if type(config) is kind)
-    modules[chosen].main(config)
-    return 0
+    return next(int(module.main(config) or 0) for module, kind in benches.values() if type(config) is kind)
 
 
-def _bench_modules(names: Iterable[str]) -> dict[str, ModuleType]:
-    """Those of ``names`` that this installation has."""
-    modules = {}
-    for name in names:
-        module = f"vestcl.bench.{name}"
-        try:
-            modules[name] = import_module(module)
-        except ModuleNotFoundError as error:
-            if error.name != module:
-                raise
-    return modules
+def _benches(names: Sequence[str], asked: bool) -> dict[str, tuple[ModuleType, type]]:
+    """Modules and settings of those of ``names`` that this installation has."""
+    return {name: bench for name in names if (bench := _bench_of(name, asked)) is not None}
+
+
+def _bench_of(name: str, asked: bool) -> tuple[ModuleType, type] | None:
+    """None where there is none of that name; what is wrong with one that nobody asked for is told, and no error."""
+    path = f"vestcl.bench.{name.replace('-', '_')}"
+    try:
+        module = import_module(path)
+        return module, getattr(module, f"{name.title().replace('-', '')}Bench")
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == path:
+            return None
+        if asked:
+            raise
+        Console(stderr=True).print(Text(f"bench {name} is left out: {error!r}", style="yellow"), soft_wrap=True)
+        return None

@@ -26,5 +26,5 @@ CACHE_LINE: Final = 64
 
 #: Outputs of this many bytes and more are recycled (below, the C library recycles them itself) ...
 HOST_POOL_FROM: Final = 1 << 18
-#: ... and at most so many bytes of them are kept: the outputs of a training step at 256 x 832.
+#: ... and so many bytes of them are kept (the outputs of a training step at 256 x 832), or what was in use at once.
 HOST_POOL_BYTES: Final = 1 << 29

@@ -27,23 +27,28 @@ class _Block:
 
 class _HostPool:
     """Recycles large outputs. The C library returns theirs to the system, and the page faults of the next (5 ms for
-    the image of a 256 x 832 frame with 32 channels) cost more than the splat."""
+    the image of a 256 x 832 frame with 32 channels) cost more than the splat. What is kept free grows with what was in
+    use at once, so that outputs of any size are recycled, and a process holds at most twice what it needed."""
 
     def __init__(self) -> None:
         self._free: collections.deque[Array] = collections.deque()
         self._lock = threading.RLock()
+        self._used = self._most_used = 0
 
     def take(self, size: int) -> _Block:
         with self._lock:
             memory = next((free for free in self._free if free.nbytes == size + constants.CACHE_LINE), None)
             if memory is not None:
                 self._free = collections.deque(free for free in self._free if free is not memory)
+            self._used += size + constants.CACHE_LINE
+            self._most_used = max(self._most_used, self._used)
         return _Block(self, np.empty(size + constants.CACHE_LINE, np.uint8) if memory is None else memory)
 
     def give(self, memory: Array) -> None:
         with self._lock:
+            self._used -= memory.nbytes
             self._free.append(memory)
-            while sum(free.nbytes for free in self._free) > constants.HOST_POOL_BYTES:
+            while sum(free.nbytes for free in self._free) > max(constants.HOST_POOL_BYTES, self._most_used):
                 self._free.popleft()
 
 

@@ -16,10 +16,10 @@ import re
 import shutil
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyopencl as cl
@@ -30,6 +30,9 @@ from vestcl import constants, pocl_cpu
 Defines = Mapping[str, str | int]
 Buffer = cl.MemoryObjectHolder
 Argument = Buffer | np.generic
+
+#: Readings of a device's clock: what delays one of them does not delay the best.
+_CLOCK_READINGS: Final = 8
 
 
 class DeviceError(RuntimeError):
@@ -61,6 +64,30 @@ class KernelTime:
     name: str
     start_ns: int
     end_ns: int
+
+
+@dataclass(frozen=True)
+class Launch:
+    """One kernel of a `JobTimes`: nanoseconds of the device's clock, but ``enqueued_ns`` of time.perf_counter_ns."""
+
+    name: str
+    enqueued_ns: int
+    """Before the call that enqueues it."""
+    queued_ns: int
+    submitted_ns: int
+    start_ns: int
+    end_ns: int
+
+
+@dataclass(frozen=True)
+class JobTimes:
+    """One outermost job that an observer is told of: nanoseconds of time.perf_counter_ns."""
+
+    session: "Session"
+    start_ns: int
+    end_ns: int
+    """When its results were there."""
+    launches: tuple[Launch, ...]
 
 
 # ---------------------------------------------------------------- devices
@@ -211,6 +238,29 @@ def source(name: str) -> str:
 
 # ---------------------------------------------------------------- sessions and jobs
 
+#: Who is told of jobs. One for the process: what is observed runs in threads that the observer does not know.
+_observer: Callable[[JobTimes], None] | None = None
+
+
+@contextlib.contextmanager
+def observe(observer: Callable[[JobTimes], None]) -> Iterator[None]:
+    """Tell ``observer`` of every job, on any device and in any thread, that begins and ends inside the ``with`` block.
+
+    Args:
+        observer: called when a job's results are there, in the job's thread, with its session locked.
+
+    Raises:
+        ValueError: there is an observer already.
+    """
+    global _observer
+    if _observer is not None:
+        raise ValueError("`observer` must be the only one, got a second")
+    _observer = observer
+    try:
+        yield
+    finally:
+        _observer = None
+
 
 class Session:
     """An open device: its context, queue, compiled programs and scratch memory. Use it from any thread."""
@@ -226,12 +276,13 @@ class Session:
         self.compiles_builtins = info.platform.startswith(("Portable Computing Language", "Intel"))
         self._context = cl.Context([device])
         self._device = device
-        self._queue = cl.CommandQueue(self._context)
+        self._plain_queue = self._queue = cl.CommandQueue(self._context)
         self._kernels: dict[tuple[str, tuple[tuple[str, str | int], ...]], dict[str, cl.Kernel]] = {}
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self._queue))
         self._lock = threading.RLock()
         self._job: Job | None = None
         self._profile: list[tuple[str, cl.Event]] | None = None
+        self._launched: list[tuple[str, int, cl.Event]] | None = None
 
     def __repr__(self) -> str:
         return f"Session({self.info.index} {self.info.platform} / {self.info.name}, mapping={self.mapping!r})"
@@ -268,20 +319,52 @@ class Session:
         except cl.RuntimeError as error:
             raise DeviceError(f"{file} does not build on {self.info.name} with {' '.join(options)}:\n{error}") from None
 
+    def clock_bounds(self) -> tuple[int, int]:
+        """By how much the device's clock is ahead of time.perf_counter_ns: at least and at most, nanoseconds.
+
+        Every reading lies between two of the host's clock, whether the device has a call for it (OpenCL 2.1) or it
+        takes an event's times.
+        """
+        with self._lock:
+            bounds = [self._clock_bounds() for _ in range(_CLOCK_READINGS)]
+        return max(low for low, _ in bounds), min(high for _, high in bounds)
+
+    def _clock_bounds(self) -> tuple[int, int]:
+        before = time.perf_counter_ns()
+        try:
+            first = last = self._device.device_and_host_timer()[0]
+        except cl.Error:
+            before = time.perf_counter_ns()
+            event = cl.enqueue_marker(self._timing_queue)
+            event.wait()
+            first, last = event.profile.queued, event.profile.end
+        after = time.perf_counter_ns()
+        return last - after, first - before
+
+    @functools.cached_property
+    def _timing_queue(self) -> cl.CommandQueue:
+        return cl.CommandQueue(self._context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+
+    def _begin(self) -> None:
+        """Before an outermost job: both queues are empty, so that changing them changes no order."""
+        self._launched = None if _observer is None else []
+        times = self._profile is not None or _observer is not None
+        self._queue = self._timing_queue if times else self._plain_queue
+
     @contextlib.contextmanager
     def profile(self) -> Iterator[list[KernelTime]]:
         """Collect every kernel's start and end inside the ``with`` block; the list is filled when it ends."""
         times: list[KernelTime] = []
         with self._lock:
-            plain = self._queue
-            self._queue = cl.CommandQueue(self._context, properties=cl.command_queue_properties.PROFILING_ENABLE)
             events: list[tuple[str, cl.Event]] = []
-            self._profile = events
+            before = self._queue
+            before.finish()
+            self._queue, self._profile = self._timing_queue, events
             try:
                 yield times
             finally:
                 self._queue.finish()
-                self._queue, self._profile = plain, None
+                self._queue, self._profile = before, None
                 times.extend(KernelTime(name, e.profile.start, e.profile.end) for name, e in events)
 
 
@@ -297,7 +380,9 @@ class Job:
     def __enter__(self) -> "Job":
         self.session._lock.acquire()
         self._outer, self.session._job = self.session._job, self
-        self._started = time.perf_counter()
+        self._started = time.perf_counter_ns()
+        if self._outer is None:
+            self.session._begin()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -307,13 +392,25 @@ class Job:
                 self.session._queue.finish()
             elif self._outer is None:
                 self.sync()
+                self._tell()
             else:  # the outer job waits for all
                 self._outer._bound += self._bound
                 self._outer._outputs += self._outputs
         finally:
             if self._outer is None:
-                self.session.seconds += time.perf_counter() - self._started
+                self.session.seconds += (time.perf_counter_ns() - self._started) / 1e9
             self.session._lock.release()
+
+    def _tell(self) -> None:
+        """The observer, of the launches that are done."""
+        launched, self.session._launched = self.session._launched, None
+        if launched and _observer is not None:
+            end = time.perf_counter_ns()
+            launches = (
+                Launch(name, enqueued, e.profile.queued, e.profile.submit, e.profile.start, e.profile.end)
+                for name, enqueued, e in launched
+            )
+            _observer(JobTimes(self.session, self._started, end, tuple(launches)))
 
     def read(self, array: np.ndarray) -> Buffer:
         """``array`` as kernel input; on a CPU device the kernel reads the array itself."""
@@ -352,9 +449,12 @@ class Job:
         values: Sequence[Any] = arguments  # pyopencl's type for them leaves out its own pooled buffers
         kernel.set_args(*values)
         local = tuple(local_size) if local_size else (1,) * len(global_size)
+        enqueued = time.perf_counter_ns()
         event = cl.enqueue_nd_range_kernel(self.session._queue, kernel, tuple(global_size), local)
         if self.session._profile is not None:
             self.session._profile.append((name, event))
+        if self.session._launched is not None:
+            self.session._launched.append((name, enqueued, event))
 
     def sync(self) -> None:
         """Wait for everything enqueued; afterwards the arrays given to `write` hold their results."""

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import torch
 
-from vestcl import constants, runtime
+from vestcl import runtime
 from vestcl.bench._measure import Facts, both_passes, facts_of
 from vestcl.bench._scenes import Scene
 from vestcl.bench._timing import Spread, watching_others
@@ -62,7 +61,7 @@ def measure_kernels(scene: Scene) -> Profile:
         name: np.array([sum(k.end_ns - k.start_ns for k in times if k.name == name) / 1e9 for times in calls])
         for name in launches
     }
-    moved = _bytes(scene, facts_of(scene))
+    moved = bytes_of(scene, facts_of(scene))
     kernels = tuple(_kernel(name, count, seconds[name], moved.get(name)) for name, count in launches.items())
     idle = [wall - sum(k.end_ns - k.start_ns for k in times) / 1e9 for wall, times in zip(walls, calls, strict=True)]
     return Profile(float(scene.radii.max()), kernels, Spread.of(np.array(walls)), statistics.median(idle), others.cores)
@@ -75,16 +74,15 @@ def _kernel(name: str, launches: int, seconds: np.ndarray, moved: int | None) ->
     return Kernel(name, launches, spread, moved / 1e6, moved / 1e9 / spread.median)
 
 
-def _bytes(scene: Scene, facts: Facts) -> dict[str, int]:
-    """What each kernel must move; not for those that take next to no time."""
+def bytes_of(scene: Scene, facts: Facts) -> dict[str, int]:
+    """What each kernel must move, bytes, by name; not for those that take next to no time."""
     raster = rasterize(scene.points_uv, scene.z, scene.radii, scene.opacities, scene.height, scene.width)
     real, index = scene.z.element_size(), 4
     row, number = real * facts.channels, real + index
     entries = int(raster.lists.tile_starts[-1])
-    lists, records = 2 * real * entries, (6 * real + 2 * index) * entries
+    lists, records = 2 * real * entries, (4 * real + 2 * index) * entries
     pixels, shown = facts.height * facts.width, facts.shown_points
     forward = records + row * shown + (row + real) * pixels
-    cleared = facts.points - int(_in_one_tile(scene).sum())
     sort = lists + records + 4 * real * shown
     return {
         "count_tiles": (5 * real + index) * facts.points,
@@ -93,15 +91,22 @@ def _bytes(scene: Scene, facts: Facts) -> dict[str, int]:
         "sort_tiles_together": sort,
         "composite_tiles": forward,
         "composite_pixels": forward,
-        "clear_gradients": index * facts.points + (row + 4 * real) * cleared,
+        "clear_gradients": index * facts.points + (row + 4 * real) * (facts.points - shown),
         "composite_tiles_backward": records + (2 * row + 4 * real) * shown + row * pixels,
     }
 
 
-def _in_one_tile(scene: Scene) -> torch.Tensor:
-    """[1, N] bool: points whose pixels are there, and are all in one tile."""
-    reach = scene.radii[..., None]
-    last = torch.tensor([scene.width - 1, scene.height - 1])
-    low = (scene.points_uv - reach - 0.5).ceil().clamp(min=0).long()
-    high = torch.minimum((scene.points_uv + reach - 0.5).floor().long(), last)
-    return ((low <= high) & (low // constants.TILE == high // constants.TILE)).all(-1)
+def flops_of(facts: Facts) -> dict[str, int]:
+    """Additions and multiplications that the formulas of `splat` ask of each kernel, by name; sorting has none.
+
+    A fragment's alpha takes 7 (two differences, d2, the slope), its weight and what it lets through 3, its features two
+    a channel. Backward: alpha and what it lets through 9, the weight 1, two dot products a channel, 18 for the rest.
+    """
+    pixels, fragments, channels = facts.height * facts.width, facts.fragments, facts.channels
+    forward = (10 + 2 * channels) * fragments + (1 + 2 * channels) * pixels
+    return {
+        "count_tiles": 18 * facts.points,  # the corners of the footprint 8, whether all numbers are finite 10
+        "composite_tiles": forward,
+        "composite_pixels": forward,
+        "composite_tiles_backward": (28 + 4 * channels) * fragments,
+    }

@@ -2,22 +2,23 @@
 
 import contextlib
 import dataclasses
-import importlib.metadata
 import json
 import os
-import platform
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 
-from vestcl import __version__, runtime
-from vestcl.bench import _fragments, _kernels, _measure, _peers, _pytorch3d, _report, _scenes, _timing
+from vestcl import runtime, trace
+from vestcl.bench import _fragments, _kernels, _measure, _peers, _plots, _pytorch3d, _report, _results, _scenes, _timing
+from vestcl.bench._results import Measure, Results, describe
+from vestcl.scoring.tables import Grid
+
+__all__ = ["WIDTH", "SplatBench", "describe", "main", "write_json"]
 
 #: Channels of the features: what the encoder gives (SPEC section 3).
 CHANNELS: Final = 32
@@ -33,8 +34,6 @@ TARGETS: Final = {(256, 832, 1.0): (6.0, 8.0), (256, 832, 2.0): (10.0, 16.0)}
 
 #: Columns of the tables where they don't go to a terminal, whose own number counts there.
 WIDTH: Final = 140
-
-_PACKAGES: Final = ("torch", "numpy", "pyopencl", "pocl-binary-distribution")
 
 
 @dataclass(frozen=True)
@@ -62,9 +61,23 @@ class SplatBench:
     channels: bool = False
     """Also 3, 4, 16, 32, 37 and 64 channels."""
     device: str | None = None
-    """OpenCL device: an index of `vestcl devices` or a part of its name."""
+    """OpenCL device: an index of `vestcl devices`, a part of its name, or "all": every one that works."""
     json: Path | None = None
     """File for the results."""
+    markdown: Path | None = None
+    """File for the tables."""
+    plots: Path | None = None
+    """Folder for plots (PNG)."""
+    trace: Path | None = None
+    """File for a trace of the kernels, which ui.perfetto.dev opens; times are a bit longer while it is recorded."""
+
+
+class Part(NamedTuple):
+    """What one measurement adds to the results."""
+
+    details: dict[str, Any]
+    measures: list[Measure]
+    grids: list[Grid]
 
 
 def main(config: SplatBench) -> None:
@@ -76,15 +89,10 @@ def main(config: SplatBench) -> None:
     """
     _check(config)
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
-    with runtime.use(config.device) as session, _timing.torch_threads(config.threads):
-        machine = describe(session)
-        for name, value in machine.items():
-            console.print(f"{name}: {value}", soft_wrap=True, highlight=False)
-        results = {key: value for part in _parts(config, console) for key, value in part.items()}
-    if config.json is not None:
-        settings = dataclasses.asdict(config) | {"json": str(config.json), "channels_of_scenes": CHANNELS}
-        write_json(config.json, {"machine": machine, "config": settings, **results})
-        console.print(f"wrote {config.json}", soft_wrap=True)
+    with trace.record(config.trace), _timing.torch_threads(config.threads):
+        results = _results.measure_each(config.device, partial(_measure_device, config, console), console)
+    _results.save(results, config.json, config.markdown)
+    _results.tell_written(console, config.json, config.markdown, config.trace, config.plots)
 
 
 def _check(config: SplatBench) -> None:
@@ -95,51 +103,72 @@ def _check(config: SplatBench) -> None:
         raise ValueError(f"`radii` must be one or more positive numbers, got {config.radii}")
 
 
-def _parts(config: SplatBench, console: Console) -> Iterator[dict[str, Any]]:
+def _measure_device(config: SplatBench, console: Console, session: runtime.Session) -> Results:
+    """Everything on one device, printed as it comes."""
+    machine = describe(session)
+    _results.show_machine(machine, console)
+    parts = list(_parts(config, console))
+    details = {key: value for part in parts for key, value in part.details.items()}
+    settings = _results.settings(config) | {"channels_of_scenes": CHANNELS}
+    if config.plots is not None:
+        _plot(config.plots, session.info, details)
+    plain = {key: _results.plain(value) for key, value in details.items()}
+    measures = [measure for part in parts for measure in part.measures]
+    grids = [grid for part in parts for grid in part.grids]
+    return Results("splat", machine, settings, measures, grids, plain)
+
+
+def _parts(config: SplatBench, console: Console) -> Iterator[Part]:
     """Measure and print part after part."""
-    yield {"speed": _speed(config, console)}
+    yield _speed(config, console)
     if config.peers:
         yield _peers_part(config, console)
     yield _inside(config, console)
     if config.scaling:
         scenes = [(height, width, CHANNELS, radius) for radius in config.radii for height, width in SIZES]
-        yield {"scaling": _series(config, console, "Over size", scenes)}
+        yield _series(config, console, "scaling", "Over size", scenes)
     if config.channels:
         scenes = [(config.height, config.width, count, radius) for radius in config.radii for count in CHANNEL_SWEEP]
-        yield {"channels": _series(config, console, "Over channels", scenes)}
+        yield _series(config, console, "channels", "Over channels", scenes)
 
 
 def _scene(config: SplatBench, radius: float) -> _scenes.Scene:
     return _scenes.street(config.height, config.width, CHANNELS, radius, config.seed)
 
 
-def _speed(config: SplatBench, console: Console) -> list[dict[str, Any]]:
-    speeds = []
+def _print(console: Console, grid: Grid) -> Grid:
+    console.print(_report.screen(grid))
+    return grid
+
+
+def _speed(config: SplatBench, console: Console) -> Part:
+    speeds, grids = [], []
     for radius in config.radii:
-        with console.status(f"splat beside copies, radius {radius:g}"):
+        with _stage(console, f"splat beside copies, radius {radius:g}"):
             targets = TARGETS.get((config.height, config.width, radius), (None, None))
             speeds.append(_measure.measure_speed(_scene(config, radius), config.seconds, config.threads, targets))
-        console.print(_report.speed_table(speeds[-1]))
-    return [dataclasses.asdict(speed) for speed in speeds]
+        grids.append(_print(console, _report.speed_grid(speeds[-1])))
+    return Part({"speed": speeds}, [measure for one in speeds for measure in _report.speed_measures(one)], grids)
 
 
-def _peers_part(config: SplatBench, console: Console) -> dict[str, Any]:
+def _peers_part(config: SplatBench, console: Console) -> Part:
     expanding, compiled = _expanding(config, console)
     torch_peers = {kind: partial(_peers.splat, kind=kind, expanding=expanding) for kind in _peers.KINDS}
-    found = []
+    found, grids = [], []
     for radius in config.radii:
-        with console.status(f"splat beside torch, radius {radius:g}"):
+        with _stage(console, f"splat beside torch, radius {radius:g}"):
             found.append(_measure.measure_peers(_scene(config, radius), torch_peers, config.seconds))
-        console.print(_report.peer_table(found[-1]))
+        grids.append(_print(console, _report.peer_grid(found[-1])))
     if _pytorch3d.is_installed():
-        with console.status("splat beside PyTorch3D"):
+        with _stage(console, "splat beside PyTorch3D"):
             scene = _scenes.street(*_pytorch3d.SIZE, CHANNELS, config.radii[0], config.seed)
             pytorch3d = partial(_pytorch3d.splat, layers=_measure.facts_of(scene).most_layers)
             found.append(_measure.measure_peers(scene, {"pytorch3d": pytorch3d}, config.seconds))
-        console.print(_report.peer_table(found[-1]))
+        grids.append(_print(console, _report.peer_grid(found[-1])))
     else:
         console.print("PyTorch3D is not installed: skipped")
-    return {"peers": [dataclasses.asdict(result) for result in found], "peers_compiled": compiled}
+    measures = [measure for one in found for measure in _report.peer_measures(one)]
+    return Part({"peers": found, "peers_compiled": compiled}, measures, grids)
 
 
 def _expanding(config: SplatBench, console: Console) -> tuple[Callable[..., _fragments.Candidates], bool]:
@@ -154,69 +183,55 @@ def _expanding(config: SplatBench, console: Console) -> tuple[Callable[..., _fra
         return _fragments.expand, False
 
 
-def _inside(config: SplatBench, console: Console) -> dict[str, Any]:
+def _inside(config: SplatBench, console: Console) -> Part:
     """Kernels and memory."""
-    profiles, memories = [], []
+    profiles, memories, grids = [], [], []
     for radius in config.radii:
-        with console.status(f"kernels, radius {radius:g}"):
+        with _stage(console, f"kernels, radius {radius:g}"):
             scene = _scene(config, radius)
             profiles.append(_kernels.measure_kernels(scene))
             memories.append(_measure.measure_memory(scene))
-        console.print(_report.kernel_table(profiles[-1]))
-    for memory in memories:
-        console.print(_report.memory_line(memory), highlight=False, soft_wrap=True)
-    return {
-        "kernels": [dataclasses.asdict(profile) for profile in profiles],
-        "memory": [dataclasses.asdict(memory) for memory in memories],
-    }
+        grids.append(_print(console, _report.kernel_grid(profiles[-1])))
+    grids.append(_print(console, _report.memory_grid(memories)))
+    pairs = zip(profiles, memories, strict=True)
+    measures = [measure for pair in pairs for measure in _report.inside_measures(*pair)]
+    return Part({"kernels": profiles, "memory": memories}, measures, grids)
 
 
 def _series(
-    config: SplatBench, console: Console, title: str, scenes: list[tuple[int, int, int, float]]
-) -> list[dict[str, Any]]:
+    config: SplatBench, console: Console, name: str, title: str, scenes: Sequence[tuple[int, int, int, float]]
+) -> Part:
     """Time (height, width, channels, radius) one by one."""
     speeds = []
     for height, width, channels, radius in scenes:
-        with console.status(f"{height}x{width}, {channels} channels, radius {radius:g}"):
+        with _stage(console, f"{height}x{width}, {channels} channels, radius {radius:g}"):
             scene = _scenes.street(height, width, channels, radius, config.seed)
             speeds.append(_measure.measure_speed(scene, config.seconds, config.threads))
-    console.print(_report.series_table(title, speeds))
-    for line in _report.growth_lines(speeds):
-        console.print(line, highlight=False, soft_wrap=True)
-    return [dataclasses.asdict(speed) for speed in speeds]
+    grid = _print(console, _report.series_grid(title, speeds))
+    measures = [
+        dataclasses.replace(measure, name=f"{title.lower()}: {measure.name}")
+        for one in speeds
+        for measure in _report.speed_measures(one)
+    ]
+    return Part({name: speeds}, measures, [grid])
 
 
-# ---------------------------------------------------------------- machine and file
+@contextlib.contextmanager
+def _stage(console: Console, name: str) -> Iterator[None]:
+    """Tell what is going on, on the screen and in the trace."""
+    with console.status(name), trace.stage(name):
+        yield
 
 
-def describe(session: runtime.Session) -> dict[str, str]:
-    """What the numbers depend on: versions, device, processor, date."""
-    versions = {}
-    for package in _PACKAGES:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[package] = importlib.metadata.version(package)
-    return {
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "vestcl": __version__,
-        **versions,
-        "python": platform.python_version(),
-        "system": platform.platform(),
-        "device": f"{session.info.index} {session.info.platform} / {session.info.name}",
-        "driver": session.info.driver,
-        "compute units": str(session.info.compute_units),
-        "mapping": session.mapping,
-        "processor": _processor(),
-        "cores": str(os.cpu_count()),
-    }
-
-
-def _processor() -> str:
-    """The CPU's model, as its maker calls it."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+def _plot(folder: Path, info: runtime.DeviceInfo, details: dict[str, Any]) -> None:
+    """What was measured on one device."""
+    device = f"{info.platform} / {info.name}"
+    for name, over in (("scaling", "size"), ("channels", "channels")):
+        if name in details:
+            path = folder / _plots.file_name(f"splat over {over} {info.index}")
+            _report.series_plot(path, f"splat over {over}\n{device}", details[name], over == "size")
+    path = folder / _plots.file_name(f"splat kernels {info.index}")
+    _report.kernel_plot(path, f"splat's kernels\n{device}", details["kernels"])
 
 
 def write_json(path: Path, results: dict[str, Any]) -> None:

@@ -32,7 +32,7 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Layer:
-    """One feature set on a geometry: what compositing reads. ``finite`` comes from the forward."""
+    """One feature set on a geometry: what compositing reads."""
 
     geometry: Geometry
     lists: TileLists
@@ -80,14 +80,18 @@ class Layer:
 
 
 def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
-    """Image [B, H, W, C] and coverage [B, H, W], and what the backward needs to know of features that aren't finite."""
+    """Image [B, H, W, C], coverage [B, H, W], and what the forward learnt for the backward, int32.
+
+    That is for the mapping "pixel" whether each point's features are finite [P], and for "tile" pack_walked of
+    kernels/splat_walk.h [B * tiles].
+    """
     geometry, lists = layer.geometry, layer.lists
     image = host_memory.empty((geometry.batch, geometry.height, geometry.width, layer.channels), layer.dtype)
     coverage = host_memory.empty(image.shape[:3], layer.dtype)
     tiles = len(lists.tile_slots)
-    finite = np.ones(geometry.points if layer.pixels else tiles, np.int32)
+    learnt = np.ones(geometry.points if layer.pixels else tiles, np.int32)
     if geometry.batch == 0:
-        return image, coverage, finite
+        return image, coverage, learnt
     with lists.session.job() as job:
         features = _read(job, layer.features)
         backgrounds = job.read(layer.backgrounds_or_zero())
@@ -96,30 +100,30 @@ def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
         if not layer.pixels:
             job.launch(
                 _TILES, "composite_tiles", layer.defines(), (tiles,),
-                [*layer.scalars(), *lists_read, features, backgrounds, *shown, job.write(finite)],
+                [*layer.scalars(), *lists_read, features, backgrounds, *shown, job.write(learnt)],
             )  # fmt: skip
-            return image, coverage, finite
+            return image, coverage, learnt
         defines = layer.defines()
-        finite_written = job.write(finite) if geometry.points else job.scratch(1, np.int32)
+        learnt_written = job.write(learnt) if geometry.points else job.scratch(1, np.int32)
         if geometry.points:
             count = np.int32(geometry.points)
-            job.launch(_PIXELS, "find_finite", defines, (geometry.points,), [count, features, finite_written])
+            job.launch(_PIXELS, "find_finite", defines, (geometry.points,), [count, features, learnt_written])
         job.launch(
             _PIXELS, "composite_pixels", defines, (tiles * _GROUP, -(-layer.channels // layer.channel_group)),
-            [*layer.scalars(), *lists_read, finite_written, features, backgrounds, *shown],
+            [*layer.scalars(), *lists_read, learnt_written, features, backgrounds, *shown],
             (_GROUP, 1),
         )  # fmt: skip
-    return image, coverage, finite
+    return image, coverage, learnt
 
 
 def composite_backward(
-    layer: Layer, finite: Array, grad_image: Array, grad_coverage: Array | None, wanted: Wanted
+    layer: Layer, learnt: Array, grad_image: Array, grad_coverage: Array | None, wanted: Wanted
 ) -> dict[str, Array]:
     """The wanted gradients, by name.
 
     Args:
         layer: as in the forward.
-        finite: from the forward.
+        learnt: from the forward.
         grad_image: [B, C, H, W] in any memory order; planes and channels-last are read in place.
         grad_coverage: [B, H, W]; None is zero.
         wanted: the gradients to compute.
@@ -146,7 +150,7 @@ def composite_backward(
             clear: list[runtime.Argument] = [np.int32(geometry.points), layer.lists.places, *outputs]
             chunks = chunks_of(layer.lists.session, geometry.points, 1)
             job.launch(file, "clear_gradients", defines, (chunks,), clear)
-        launch(job, layer, defines, finite, grad_image, grad_coverage, outputs, per_tile)
+        launch(job, layer, defines, learnt, grad_image, grad_coverage, outputs, per_tile)
         if wanted.backgrounds:
             total: list[runtime.Argument] = [np.int32(geometry.tiles), per_tile, backgrounds]
             job.launch(file, "sum_grad_backgrounds", defines, (layer.channels, geometry.batch), total)
@@ -154,7 +158,7 @@ def composite_backward(
 
 
 def _launch_tiles_backward(
-    job: runtime.Job, layer: Layer, defines: dict[str, str | int], finite: Array, grad_image: Array,
+    job: runtime.Job, layer: Layer, defines: dict[str, str | int], learnt: Array, grad_image: Array,
     grad_coverage: Array | None, outputs: list[runtime.Buffer], per_tile: runtime.Buffer,
 ) -> None:  # fmt: skip
     lists = layer.lists
@@ -165,7 +169,7 @@ def _launch_tiles_backward(
     checkpoints = int(segments.sum()) if segments.max(initial=1) > 1 else 1
     inputs = [
         job.read(lists.tile_starts), lists.records, _read(job, layer.features),
-        _read(job, layer.backgrounds), job.read(finite), job.read(grad_image), _read(job, grad_coverage),
+        _read(job, layer.backgrounds), job.read(learnt), job.read(grad_image), _read(job, grad_coverage),
         job.read(checkpoint_starts),
         job.scratch(checkpoints * (constants.TILE + 1) ** 2, layer.dtype), job.scratch(checkpoints, np.int32),
     ]  # fmt: skip
@@ -177,7 +181,7 @@ def _launch_tiles_backward(
 
 
 def _launch_pixels_backward(
-    job: runtime.Job, layer: Layer, defines: dict[str, str | int], finite: Array, grad_image: Array,
+    job: runtime.Job, layer: Layer, defines: dict[str, str | int], learnt: Array, grad_image: Array,
     grad_coverage: Array | None, outputs: list[runtime.Buffer], per_tile: runtime.Buffer,
 ) -> None:  # fmt: skip
     geometry, lists = layer.geometry, layer.lists
@@ -190,7 +194,7 @@ def _launch_pixels_backward(
     entries = [job.read(lists.tile_starts), lists.records, starts, lists.slot_starts]
     job.launch(
         _PIXELS, "composite_pixels_backward", defines, (tiles * _GROUP,),
-        [*layer.scalars(), *strides, *entries, _read(job, finite), _read(job, layer.features),
+        [*layer.scalars(), *strides, *entries, _read(job, learnt), _read(job, layer.features),
          _read(job, layer.backgrounds), grad, _read(job, grad_coverage), weights, slot_grads, transmittance],
         (_GROUP,),
     )  # fmt: skip
@@ -210,7 +214,7 @@ def _launch_pixels_backward(
 def _phases(layer: Layer) -> Iterator[tuple[list[np.int32], tuple[int, int, int]]]:
     """Launches that together visit every tile; no two tiles of a launch share a point. (x0, y0, steps), grid."""
     rows, columns = layer.geometry.grid
-    step_x, step_y = min(layer.lists.span, columns), min(layer.lists.span, rows)
+    step_y, step_x = layer.lists.steps
     for y in range(step_y):
         for x in range(step_x):
             grid = -(-(columns - x) // step_x), -(-(rows - y) // step_y), layer.geometry.batch

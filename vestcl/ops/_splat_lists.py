@@ -29,6 +29,8 @@ class Geometry:
     """[B + 1] int32: cloud b owns points cloud_starts[b] up to cloud_starts[b + 1]."""
     height: int
     width: int
+    list_transparent: bool
+    """Whether points of opacity 0 are listed: they show nothing, but the gradient of their opacity is not 0."""
 
     @property
     def points(self) -> int:
@@ -64,8 +66,8 @@ class TileLists:
     """[B * tiles + 1] int32."""
     tile_slots: Array
     """[B * tiles] int64: room that the backward needs, in pixels of all footprints inside the tile."""
-    span: int
-    """Most tiles that a footprint covers along an axis."""
+    steps: tuple[int, int]
+    """Rows and columns of tiles from one tile to the next that certainly share no point."""
     records: runtime.Buffer
     """[E] record_t of kernels/splat.h."""
     places: runtime.Buffer
@@ -95,10 +97,11 @@ def list_tiles(session: runtime.Session, geometry: Geometry) -> TileLists:
             job.read(array)
             for array in (geometry.cloud_starts, geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
         )
+        transparent = np.int32(geometry.list_transparent)
         counts = job.scratch(geometry.batch * chunks * geometry.tiles, np.int32)
         job.launch(
             "splat_bin.cl", "count_tiles", defines, (chunks, geometry.batch),
-            [*geometry.sizes, starts, points_uv, z, radii, opacities, places, counts, job.write(spans)],
+            [*geometry.sizes, starts, points_uv, z, radii, opacities, transparent, places, counts, job.write(spans)],
         )  # fmt: skip
         job.launch(
             "splat_bin.cl", "scan_chunks", defines, (geometry.tiles, geometry.batch),
@@ -140,14 +143,16 @@ def _sort(
 ) -> TileLists:
     """Sort every tile's entries by (z, index) into records. Without points there is nothing to sort."""
     count, tiles = int(tile_starts[-1]), len(tile_starts) - 1
+    rows, columns = geometry.grid
+    steps = min(span, rows), min(span, columns)
     together = job.session.mapping == "pixel"
-    records = job.scratch(count, np.dtype(f"V{6 * geometry.z.dtype.itemsize + 8}"))
+    records = job.scratch(count, np.dtype(f"V{4 * geometry.z.dtype.itemsize + 8}"))
     slot_starts = job.scratch(count if together else 0, np.int64)
     tile_slots = np.zeros(tiles, np.int64)
     if entries is not None and count:
         arrays = (tile_starts, geometry.points_uv, geometry.radii, geometry.opacities)
         room = job.scratch(count, _entry_type(geometry))
-        arguments: list[runtime.Argument] = [*geometry.sizes, *map(job.read, arrays)]
+        arguments: list[runtime.Argument] = [*geometry.sizes, *map(np.int32, steps), *map(job.read, arrays)]
         arguments += [entries, room, records, job.write(tile_slots)]
         defines = _defines(job.session, geometry)
         if together:
@@ -158,4 +163,4 @@ def _sort(
             )  # fmt: skip
         else:
             job.launch("splat_bin.cl", "sort_tiles", defines, (tiles,), arguments)
-    return TileLists(job.session, tile_starts, tile_slots, span, records, places, slot_starts)
+    return TileLists(job.session, tile_starts, tile_slots, steps, records, places, slot_starts)

@@ -11,6 +11,9 @@ from vestcl import constants, runtime
 from vestcl.ops._arguments import Array, as_array, check, check_starts, require_no_grad
 from vestcl.ops._splat_composite import Layer, Wanted, composite_backward, composite_forward
 from vestcl.ops._splat_lists import Geometry, TileLists, list_tiles
+from vestcl.ops._splat_skipped import Skipped, count_culled
+
+__all__ = ["Raster", "Skipped", "composite", "rasterize", "skipped", "splat"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +58,8 @@ def splat(
 
     Exact: any number of fragments a pixel, no epsilon, no division by 1 - a in the gradient, the same bits on any
     number of cores. Points with z < 0.1 m, a radius <= 0 (or so extreme that its square is no normal number) or any
-    number that is not finite (a feature counts) are skipped, and their gradients are 0.
+    number that is not finite (a feature counts) are skipped, and their gradients are 0; so are points of opacity 0
+    unless the gradient of the opacities is asked for. `skipped` counts them.
 
     Clouds of different sizes cost no padding when they are packed: concatenate the points of all clouds (without the
     leading B), and say in ``cloud_starts`` where each begins. Dense clouds padded with points of radius 0 work too; a
@@ -104,10 +108,11 @@ def rasterize(
 ) -> Raster[Array]:
     """The geometric half of `splat`, for several feature sets on one geometry: depth-sorted lists of points per tile.
 
-    Args and raises as in `splat`. Gradients flow through `composite` into the arguments given here.
+    Args and raises as in `splat`. Gradients flow through `composite` into the arguments given
+    here, which must require grad already if they are to have one.
 
     Returns:
-        A `Raster`. It holds device memory (about 32 bytes for each point and tile that it touches, in float32) and a
+        A `Raster`. It holds device memory (about 24 bytes for each point and tile that it touches, in float32) and a
         copy of the numbers: changing the arguments in place afterwards does not change it.
     """
     require_no_grad("z", z)
@@ -132,6 +137,7 @@ def rasterize(
         cloud_starts=starts.astype(np.int32),
         height=_size("height", height),
         width=_size("width", width),
+        list_transparent=_requires_grad(opacities),
     )
     lists = list_tiles(runtime.current(), geometry)
     return Raster(points_uv, radii, opacities, cloud_starts is not None, geometry, lists)
@@ -152,11 +158,48 @@ def composite(
         raise ValueError(f"`features` must have 1 to {constants.MAX_CHANNELS} channels, got {channels}")
     if not 0 <= min_transmittance < 1:
         raise ValueError(f"`min_transmittance` must be in [0, 1), got {min_transmittance}")
+    if _requires_grad(raster.opacities) and not raster.geometry.list_transparent:
+        raise ValueError("`raster.opacities` must require grad when `rasterize` is called, got them requiring it since")
     if not isinstance(features, torch.Tensor):
         image, coverage, _ = composite_forward(_layer(raster, features, backgrounds, min_transmittance))
         return image.transpose(0, 3, 1, 2), coverage[:, None]
     return _Composite.apply(
         raster, min_transmittance, raster.points_uv, raster.radii, raster.opacities, features, backgrounds
+    )
+
+
+def skipped(raster: Raster[Array], min_transmittance: float = 0.0) -> Skipped:
+    """Count what compositing on ``raster`` skips: points that no list holds, tiles without points, opaque pixels.
+
+        a pixel is saturated where T_end = 0, or T_end < min_transmittance: nothing behind changes it
+
+    Counted when asked, all images of the batch together; splatting itself counts nothing.
+
+    Args:
+        raster: from `rasterize`; the reasons are read from its arrays, so these should still be what they were.
+        min_transmittance: as in `splat`.
+
+    Returns:
+        A `Skipped`.
+
+    Raises:
+        ValueError: ``min_transmittance`` outside [0, 1).
+
+    Source: SPEC section 2 (which points make fragments).
+    """
+    if not 0 <= min_transmittance < 1:
+        raise ValueError(f"`min_transmittance` must be in [0, 1), got {min_transmittance}")
+    geometry, lists = raster.geometry, raster.lists
+    nothing = np.zeros((geometry.points, 1), geometry.z.dtype)
+    white = np.ones((geometry.batch, 1), geometry.z.dtype)
+    left, _, _ = composite_forward(Layer(geometry, lists, nothing, white, min_transmittance))  # T_end
+    return Skipped(
+        **count_culled(geometry, lists),
+        points=geometry.points,
+        tiles=len(lists.tile_slots),
+        empty_tiles=int((np.diff(lists.tile_starts) == 0).sum()),
+        pixels=left.size,
+        saturated_pixels=int(((left == 0) | (left < min_transmittance)).sum()),
     )
 
 
@@ -172,7 +215,7 @@ class _Composite(torch.autograd.Function):
         features: torch.Tensor,
         backgrounds: torch.Tensor | None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        image, coverage, ctx.finite = composite_forward(_layer(raster, features, backgrounds, min_transmittance))
+        image, coverage, ctx.learnt = composite_forward(_layer(raster, features, backgrounds, min_transmittance))
         ctx.raster, ctx.min_transmittance = raster, min_transmittance
         ctx.shapes = {"points_uv": points_uv.shape, "radii": radii.shape, "opacities": opacities.shape}
         ctx.save_for_backward(features, backgrounds)
@@ -192,7 +235,7 @@ class _Composite(torch.autograd.Function):
         names = ("points_uv", "radii", "opacities", "features", "backgrounds")
         wanted = Wanted(**dict(zip(names, ctx.needs_input_grad[2:], strict=True)))
         cover = None if grad_coverage is None else as_array(grad_coverage)
-        grads = composite_backward(layer, ctx.finite, grad_image.resolve_neg().numpy(), cover, wanted)
+        grads = composite_backward(layer, ctx.learnt, grad_image.resolve_neg().numpy(), cover, wanted)
         shapes = {**ctx.shapes, "features": features.shape}
         tensors = (torch.from_numpy(grads[name]) if name in grads else None for name in names)
         shaped = (t if t is None else t.reshape(shapes.get(n, t.shape)) for n, t in zip(names, tensors, strict=True))
@@ -203,6 +246,10 @@ def _layer(raster: Raster[Any], features: Array, backgrounds: Array | None, min_
     rows = as_array(features).reshape(-1, features.shape[-1])
     behind = None if backgrounds is None else as_array(backgrounds)
     return Layer(raster.geometry, raster.lists, rows, behind, min_transmittance)
+
+
+def _requires_grad(array: Array) -> bool:
+    return isinstance(array, torch.Tensor) and array.requires_grad
 
 
 def _size(name: str, value: int) -> int:

@@ -1,0 +1,97 @@
+// What compositing by tiles reads ahead, and how its backward walks a list forward again. After tile.h, prefetch.h.
+//
+// Points read ahead of their turn.
+#define AHEAD 16
+
+// How many entries of a tile's list the backward has to walk, and whether all their features are known to be finite.
+inline int pack_walked(int entries, bool finite) { return finite ? entries : ~entries; }
+inline int entries_walked(int packed) { return packed < 0 ? ~packed : packed; }
+inline bool all_finite(int packed) { return packed >= 0; }
+
+inline void read_ahead(global const record_t* records, int e, global const REAL* features) {
+  global const REAL* row = features + (size_t)records[e].id * CHANNELS;
+#pragma unroll
+  for (int c = 0; c < CHANNELS; c += CACHE_LINE / sizeof(REAL)) PREFETCH(row + c);
+}
+
+#ifdef GRAD_FEATURES
+inline void write_ahead(
+    global const record_t* records, int e, global REAL* grad_features, global REAL* grad_points_uv,
+    global REAL* grad_radii, global REAL* grad_opacities) {
+  const size_t id = records[e].id;
+#if GRAD_FEATURES
+  if (!is_first(records[e].box)) {
+    global REAL* row = grad_features + id * CHANNELS;
+#pragma unroll
+    for (int c = 0; c < CHANNELS; c += CACHE_LINE / sizeof(REAL)) PREFETCH_TO_WRITE(row + c);
+  }
+#endif
+#if GRAD_POINTS_UV
+  PREFETCH_TO_WRITE(grad_points_uv + 2 * id);
+#endif
+#if GRAD_RADII
+  PREFETCH_TO_WRITE(grad_radii + id);
+#endif
+#if GRAD_OPACITIES
+  PREFETCH_TO_WRITE(grad_opacities + id);
+#endif
+}
+
+// The gradient at a tile's pixels, fetched pixel by pixel while the list is walked forward, which does not need it yet.
+// `next` of `pixels` is next; none where the channels are far apart, for there a cache line holds other pixels too.
+typedef struct { global const REAL* corner; long line; uint pixels, next; } gradient_ahead_t;
+
+inline gradient_ahead_t gradient_ahead(
+    tile_t tile, int height, int width, long channel_stride, global const REAL* grad_image) {
+  gradient_ahead_t ahead;
+  ahead.line = (long)width * CHANNELS;
+  ahead.corner = grad_image + ((long)tile.b * height + tile.top) * ahead.line + (long)tile.left * CHANNELS;
+  ahead.pixels = channel_stride == 1 ? tile.height * TILE : 0;
+  ahead.next = 0;
+  return ahead;
+}
+
+inline void fetch_gradient(gradient_ahead_t* ahead) {
+  if (ahead->next == ahead->pixels) return;
+  global const REAL* pixel = ahead->corner + ahead->next / TILE * ahead->line + ahead->next % TILE * CHANNELS;
+#pragma unroll
+  for (int c = 0; c < CHANNELS; c += CACHE_LINE / sizeof(REAL)) PREFETCH_FAR(pixel + c);
+  ahead->next++;
+}
+
+// What the backward keeps of one segment, quad by quad, and of the tile's pixels.
+typedef struct { REAL4 alpha, before; } quad_t;  // a_i and T_i, 0 and 0 where there is no fragment
+typedef struct {
+  quad_t quads[SEGMENT / 4];
+  REAL transmittance[ROOM];
+} walk_t;
+
+// Walk forward from entry e until the segment is full or the list ends; returns the entry after the last.
+inline int walk_forward(
+    walk_t* walk, int e, int end, bool known_finite, tile_t tile, REAL min_transmittance,
+    global const record_t* records, global const REAL* features, gradient_ahead_t* ahead) {
+  for (int slot = 0; e < end; e++) {
+    fetch_gradient(ahead);
+    global const record_t* point = records + e;
+    const box_t box = unpack_box(point->box);
+    if (slot + quads_in(box) > SEGMENT / 4) break;
+    bool finite = true;
+    if (!known_finite) {
+      vector_t f[BLOCKS];
+      finite = load_row(features + (size_t)point->id * CHANNELS, f);
+    }
+    disc_t disc = disc_of(point, tile);
+    if (!finite) disc.r2 = 0;
+    for (int y = box.y0; y < box.y1; y += 2)
+      for (int x = box.x0; x < box.x1; x += 2, slot++) {
+        const int p = y * STRIDE + x;
+        const REAL4 t = load_quad(walk->transmittance, p);
+        quad_t quad;
+        quad.alpha = quad_alphas(disc, x, y, t, min_transmittance, &quad.before);
+        walk->quads[slot] = quad;
+        store_quad(t * (1 - quad.alpha), walk->transmittance, p);
+      }
+  }
+  return e;
+}
+#endif

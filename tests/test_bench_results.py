@@ -1,0 +1,228 @@
+"""What benchmarks hand over: files that come back, devices in turn, plots that are there."""
+
+import io
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from vestcl import doctor, runtime
+from vestcl.bench import _plots, _report, _results
+from vestcl.bench._results import Measure, Results
+from vestcl.bench._timing import Spread
+from vestcl.scoring.tables import Grid
+
+
+def results(bench: str = "abacus", device: str = "0:0 frame", **details: Any) -> Results:
+    measures = [
+        Measure("beads moved", "s", 2.0, 1.0, 3.0),
+        Measure("beads kept", "1", math.nan, 0.0, 1.0, "higher"),
+    ]
+    grid = Grid("Beads", ("", "ms"), (("moved", "2"), ("[red]kept", "-")), ("a note",))
+    return Results(bench, {"device": device, "date": "now"}, {"rows": 9}, measures, [grid], details)
+
+
+@pytest.fixture
+def console() -> Console:
+    return Console(width=100, record=True, file=io.StringIO())
+
+
+def doctored(monkeypatch: pytest.MonkeyPatch, *works: bool) -> list[runtime.DeviceInfo]:
+    """Let the doctor find devices that work or not, all of them the default one."""
+    infos = [runtime.select() for _ in works]
+    passed, failed = tuple(doctor.Step(name, True) for name in doctor.STEPS), (doctor.Step("build", False, "ill"),)
+    steps = {True: passed, False: failed}
+    reports = [
+        doctor.DeviceReport(info, steps[work], () if work else ("build: ill",))
+        for info, work in zip(infos, works, strict=True)
+    ]
+    monkeypatch.setattr(doctor, "examine", lambda: doctor.Report(tuple(reports), infos[0].index, ()))
+    return infos
+
+
+# ---------------------------------------------------------------- files
+
+
+def test_what_is_saved_comes_back(tmp_path: Path) -> None:
+    saved = [results(), results(device="1:0 other", counts=[1, 2], nested={"a": None})]
+    path, markdown = tmp_path / "new" / "r.json", tmp_path / "new" / "r.md"
+    _results.save(saved, path, markdown)
+    assert sorted(file.name for file in path.parent.iterdir()) == ["r.json", "r.md"]
+    content = json.loads(path.read_text(encoding="utf-8"), parse_constant=pytest.fail)
+    assert content["vestcl"] == 1 and content["bench"] == "abacus"
+    assert [set(device) for device in content["devices"]] == [{"machine", "config", "measures", "details"}] * 2
+    loaded = _results.load(path)
+    assert [result.grids for result in loaded] == [[], []]
+    for one, two in zip(loaded, saved, strict=True):
+        assert (one.bench, one.machine, one.config, one.details) == (two.bench, two.machine, two.config, two.details)
+        assert one.measures[0] == two.measures[0]
+        assert math.isnan(one.measures[1].median) and one.measures[1].better == "higher"
+    text = markdown.read_text(encoding="utf-8")
+    assert "0:0 frame" in text and "1:0 other" in text and text.count("| moved | 2 |") == 2 and "- date: now" in text
+
+
+def test_nothing_is_written_where_no_file_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    _results.save([results()], None, None)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("saved", "message"),
+    [([], "got none"), ([results(), results("lute")], "got abacus, lute"), ([results(x=object())], "got object")],
+)
+def test_what_can_not_be_saved_leaves_the_old_file(tmp_path: Path, saved: list[Results], message: str) -> None:
+    path = tmp_path / "r.json"
+    _results.save([results()], path, None)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=message):
+        _results.save(saved, path, None)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "no JSON"),
+        ("[]", 'must be a file of `vestcl bench NAME --json` with "vestcl": 1'),
+        ('{"vestcl": 2}', 'with "vestcl": 1'),
+        ('{"vestcl": 1, "bench": "abacus"}', "lacks or mistakes 'devices'"),
+        ('{"vestcl": 1, "bench": "abacus", "devices": [{"measures": [{"median": 1}]}]}', "lacks or mistakes 'low'"),
+        ('{"vestcl": 1, "bench": "abacus", "devices": [[]]}', "lacks or mistakes"),
+        ('{"vestcl": 1, "bench": "abacus", "devices": [{"measures": [{"median": "x"}]}]}', "float: 'x'"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, content: str, message: str) -> None:
+    path = tmp_path / "other.json"
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(ValueError, match=message) as caught:
+        _results.load(path)
+    assert str(path) in str(caught.value)
+    with pytest.raises(ValueError, match="absent"):
+        _results.load(tmp_path / "absent.json")
+
+
+def test_plain_values() -> None:
+    @dataclass(frozen=True)
+    class Config:
+        json: Path | None
+        radii: tuple[float, ...]
+
+    config = Config(Path("a/b"), (1.0, math.inf))
+    assert _results.settings(config) == {"json": "a/b", "radii": [1.0, None]}
+    assert _results.plain({1: np.float32(0.5), "a": np.arange(2), "s": Spread(1.0, 0.0, 2.0, 3)}) == {
+        "1": 0.5,
+        "a": [0, 1],
+        "s": {"median": 1.0, "low": 0.0, "high": 2.0, "runs": 3},
+    }
+
+
+def test_a_measure_of_a_spread() -> None:
+    assert Measure.of("a", "s", Spread(2.0, 1.0, 3.0, 7)) == Measure("a", "s", 2.0, 1.0, 3.0, "lower")
+
+
+def test_the_screen_shows_machine_and_tables(console: Console) -> None:
+    _results.show([results(), results(device="1:0 other")], console)
+    text = console.export_text()
+    assert "device: 0:0 frame" in text and "device: 1:0 other" in text and text.count("Beads") == 2
+
+
+# ---------------------------------------------------------------- devices
+
+
+def test_one_device_is_current_while_it_is_measured(session: runtime.Session) -> None:
+    before = runtime.current()
+    seen = [(one, runtime.current()) for one in _results.each_device(session.info.index)]
+    assert [one.info.index for one, _ in seen] == [session.info.index] and seen[0][0] is seen[0][1]
+    assert runtime.current() is before
+    machine = _results.describe(session)
+    assert {"vestcl", "torch", "numpy", "pyopencl", "driver", "processor", "cores", "date"} <= set(machine)
+    assert machine["device"].startswith(session.info.index)
+
+
+def test_all_devices_are_those_that_the_doctor_passes(monkeypatch: pytest.MonkeyPatch, console: Console) -> None:
+    infos = doctored(monkeypatch, True, False, True)
+    assert [one.info for one in _results.each_device("all", console)] == [infos[0], infos[2]]
+    assert f"{infos[1].index} {infos[1].platform} / {infos[1].name} left out: build: ill" in _flat(console)
+
+
+def test_no_device_works(monkeypatch: pytest.MonkeyPatch, console: Console) -> None:
+    doctored(monkeypatch, False)
+    with pytest.raises(runtime.DeviceError, match="`vestcl doctor` tells why"):
+        list(_results.each_device("all", console))
+
+
+def test_a_device_that_fails_is_reported_and_the_others_go_on(
+    monkeypatch: pytest.MonkeyPatch, console: Console
+) -> None:
+    doctored(monkeypatch, True, True)
+    outcomes: Iterator[Any] = iter([RuntimeError("burst"), results()])
+
+    def measure(session: runtime.Session) -> Results:
+        assert session is runtime.current()
+        outcome = next(outcomes)
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    assert [found.bench for found in _results.measure_each("all", measure, console)] == ["abacus"]
+    assert "left out: RuntimeError: burst" in _flat(console)
+    outcomes = iter([RuntimeError("burst"), RuntimeError("burst")])
+    with pytest.raises(runtime.DeviceError, match="failed on every device"):
+        _results.measure_each("all", measure, console)
+    outcomes = iter([ValueError("`height` must be positive")])
+    with pytest.raises(ValueError, match="height"):
+        _results.measure_each("all", measure, console)
+    outcomes = iter([RuntimeError("burst")])
+    with pytest.raises(RuntimeError, match="burst"):
+        _results.measure_each(None, measure, console)
+
+
+def _flat(console: Console) -> str:
+    return " ".join(console.export_text(clear=False).split())
+
+
+# ---------------------------------------------------------------- plots and tables
+
+
+SPREADS = [Spread(value, 0.8 * value, 1.3 * value, 5) for value in (1e-4, 3e-3)]
+
+
+def test_plots_are_pictures(tmp_path: Path) -> None:
+    lines = [_plots.Curve("a", [64, 256], SPREADS, 1e3), _plots.Curve("b", [64, 256], SPREADS[::-1], dashed=True)]
+    curves = _plots.curves(tmp_path / "new" / "curves.png", "title", "points", "ms", lines)
+    groups = {"a": {"x": SPREADS[0], "y": SPREADS[1]}, "b": {"y": SPREADS[0]}}
+    bars = [_plots.bars(tmp_path / f"{log}.png", "title", "ms", groups, 1e3, log=log) for log in (False, True)]
+    for path in (curves, *bars):
+        picture = np.asarray(Image.open(path).convert("L"))
+        assert picture.shape[1] == 1200 and picture.shape[0] >= 300
+        assert 0.5 < (picture > 250).mean() < 0.999, "something is drawn on white"
+        assert (picture[:, [0, -1]] > 250).mean() > 0.9, "nothing runs over the edge"
+
+
+def test_plots_of_nothing_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="`lines` must be one or more"):
+        _plots.curves(tmp_path / "a.png", "", "", "", [])
+    with pytest.raises(ValueError, match="`groups` must have one or more bars"):
+        _plots.bars(tmp_path / "a.png", "", "", {"a": {}})
+    assert not list(tmp_path.iterdir())
+
+
+def test_file_names() -> None:
+    assert _plots.file_name("Splat over size, 0:0 / a") == "splat-over-size-0-0-a.png"
+
+
+def test_verdicts_are_coloured_and_text_is_no_markup(console: Console) -> None:
+    grid = Grid("[b]title", ("", "target"), (("[red]a", "<= 6 reached"), ("b", "missed it")), _report.busy(1e6))
+    console.print(_report.screen(grid))
+    plain, styled = console.export_text(clear=False), console.export_text(styles=True)
+    assert "[b]title" in plain and "[red]a" in plain and "measure again" in " ".join(plain.split())
+    assert "\x1b[32mreached" in styled and "\x1b[31mmissed" not in styled
+    assert _report.busy(0.0, None) == ()

@@ -1,0 +1,59 @@
+"""What splatting skips, counted on demand (kernels/splat_skipped.cl)."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from vestcl import runtime
+from vestcl.ops._splat_lists import Geometry, TileLists, chunks_of
+
+#: Why a point is in no list, in the order in which the kernel asks and counts.
+REASONS: Final = ("not_finite", "behind", "no_radius", "outside", "transparent")
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """How much a rasterisation leaves out, from `skipped`. Each point counts once, for the first reason that holds."""
+
+    points: int
+    """All that there are, skipped or not."""
+    not_finite: int
+    """Points with a position, depth, radius or opacity that is NaN or infinite."""
+    behind: int
+    """Points nearer than `constants.NEAR`, 0.1 m."""
+    no_radius: int
+    """Points whose radius is <= 0 or whose squared radius is no normal number."""
+    outside: int
+    """Points whose footprint holds no pixel of the image."""
+    transparent: int
+    """Points of opacity 0, where no gradient of the opacities is asked for."""
+    tiles: int
+    """Of all images."""
+    empty_tiles: int
+    """Tiles that no point reaches."""
+    pixels: int
+    """Of all images."""
+    saturated_pixels: int
+    """Pixels whose transmittance has reached 0, or fallen below the least one asked for."""
+
+    @property
+    def culled(self) -> int:
+        """Points skipped, whatever the reason."""
+        return sum(getattr(self, reason) for reason in REASONS)
+
+
+def count_culled(geometry: Geometry, lists: TileLists) -> dict[str, int]:
+    """Points that are in no list, by `REASONS`."""
+    if geometry.points == 0:
+        return dict.fromkeys(REASONS, 0)
+    counts = np.zeros((chunks_of(lists.session, geometry.points, len(REASONS)), len(REASONS)), np.int32)
+    sizes = [np.int32(n) for n in (geometry.height, geometry.width, geometry.points)]
+    arrays = (geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
+    defines = runtime.defines_for(geometry.z.dtype)
+    with lists.session.job() as job:
+        job.launch(
+            "splat_skipped.cl", "count_skipped", defines, (len(counts),),
+            [*sizes, *map(job.read, arrays), lists.places, job.write(counts)],
+        )  # fmt: skip
+    return {reason: int(count) for reason, count in zip(REASONS, counts.sum(axis=0), strict=True)}
