@@ -1,0 +1,288 @@
+"""`vestcl bench stability`: that truth, bounds and peers are what they are called, and that the command tells."""
+
+import dataclasses
+import decimal
+import json
+import math
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from vestcl import constants, reference, runtime
+from vestcl.bench import _results, _stability_peers, stability
+from vestcl.bench._stability_bounds import UNIT, Bounds, bounds_of, growth
+from vestcl.bench._stability_cases import FAMILIES, SIZE, Case
+from vestcl.bench._stability_fragments import list_layers
+from vestcl.bench._stability_places import clear_radii, projected
+from vestcl.bench._stability_programs import OPERATORS, Operators, evaluate, relative_error
+from vestcl.bench.stability import Errors, StabilityBench
+
+TWINS = Operators(reference.unproject, reference.rigid_flow, reference.displace, reference.splat)
+
+#: Roundings of float64 are so much smaller than float32's.
+FINER = 2.0**-53 / UNIT
+
+
+def cases(*names: str) -> list[Case]:
+    chosen = [family for family in FAMILIES if not names or family.name in names]
+    return [case for family in chosen for case in family.cases(0, quick=True)]
+
+
+def case_at(family: str, knob: float) -> Case:
+    return next(case for case in cases(family) if case.knob == knob)
+
+
+def misses(errors: Errors, bounds: Bounds, factor: float = 1.0) -> list[str]:
+    """Arrays whose errors are above ``factor`` times their bounds."""
+    pairs = [
+        (name, value, getattr(bounds, kind)[name])
+        for kind in ("outputs", "gradients")
+        for name, value in getattr(errors, kind).items()
+    ]
+    return [name for name, value, bound in pairs if value > factor * bound]
+
+
+def with_splat(splat: Any) -> Operators:
+    return dataclasses.replace(OPERATORS, splat=splat)
+
+
+# ---------------------------------------------------------------- truth and bounds
+
+
+@pytest.mark.parametrize("case", cases(), ids=lambda case: case.name)
+def test_float32_keeps_the_bounds_and_float64_tighter_ones(case: Case) -> None:
+    """The truth, beside the twin in float64, keeps bounds that are 2^29 times tighter, for two that round.
+
+    Motions alone are held against 50 digits: the twin takes their difference, which the truth does not.
+    """
+    row = stability.measure_case(case, peers=False)
+    assert not row.broken
+    truth = evaluate(case, OPERATORS, torch.float64)
+    if case.program == "flow":
+        few = Errors({"displacement_xyz": error_of_motion(case, truth.outputs["displacement_xyz"])}, {})
+    else:
+        few = Errors.between(evaluate(case, TWINS, torch.float64), truth)
+    assert not misses(few, row.bounds, 2 * FINER)
+
+
+def error_of_motion(case: Case, displacement_xyz: torch.Tensor, count: int = 20) -> float:
+    """Of the first points' displacement, beside R x + t - x in 50 decimal digits."""
+    with decimal.localcontext(decimal.Context(prec=50)):
+        points, quaternion, translation = (
+            [[Decimal(number) for number in row] for row in case.inputs[name].reshape(-1, width)[:count].tolist()]
+            for name, width in (("points_xyz", 3), ("quaternion", 4), ("translation", 3))
+        )
+        length = max(sum(number**2 for number in quaternion[0]).sqrt(), Decimal(repr(constants.QUATERNION_FLOOR)))
+        w, x, y, z = (number / length for number in quaternion[0])
+        R = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]  # fmt: skip
+        wanted = [
+            [float(sum(R[i][j] * p[j] for j in range(3)) + translation[0][i] - p[i]) for i in range(3)] for p in points
+        ]
+    return relative_error(displacement_xyz[0, :count], torch.tensor(wanted, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("case", cases("layers", "opacity", "angle", "recursion"), ids=lambda case: case.name)
+def test_every_mapping_keeps_the_bounds(mapped_session: runtime.Session, case: Case) -> None:
+    assert not stability.measure_case(case, peers=False).broken
+
+
+@pytest.mark.parametrize("family", ["depth range", "layers", "opacity", "size", "recursion"])
+def test_bounds_are_no_wider_than_a_thousand_errors(family: str) -> None:
+    """Else they would prove nothing: every case's largest error comes within three digits of its bound."""
+    for case in cases(family):
+        row = stability.measure_case(case, peers=False)
+        assert row.bounds.outputs[row.output] < 1e3 * row.errors.outputs[row.output]
+        assert row.bounds.gradients[row.gradient] < 1e3 * row.errors.gradients[row.gradient]
+
+
+@pytest.mark.parametrize("name", ["features", "opacities", "radii", "points_uv"])
+def test_half_of_float32s_digits_break_a_bound(name: str) -> None:
+    """splat of one input in bfloat16's neighbourhood: 12 bits instead of 24."""
+    case = case_at("radius", 1.5)
+    truth = evaluate(case, OPERATORS, torch.float64)
+    blunt = dict(case.inputs)
+    blunt[name] = case.inputs[name] * (1 + 2.0**-12)
+    errors = Errors.between(evaluate(dataclasses.replace(case, inputs=blunt), OPERATORS, torch.float32), truth)
+    assert misses(errors, bounds_of(case, truth))
+
+
+def test_a_motion_computed_by_subtraction_breaks_its_bound() -> None:
+    row = stability.measure_case(case_at("angle", 1e-6))
+    assert not row.broken
+    assert misses(row.peers["R x + t - x"], row.bounds) == ["displacement_xyz", "points_xyz"]
+
+
+def test_bounds_are_the_same_every_time() -> None:
+    case = case_at("recursion", 5)
+    truth = evaluate(case, OPERATORS, torch.float64)
+    assert bounds_of(case, truth) == bounds_of(case, truth)
+
+
+def test_growth() -> None:
+    assert [growth(n) for n in (1, 4, 9, 16, 100)] == [1, 4, 9, 12, 30]
+
+
+@pytest.mark.parametrize(
+    ("got", "wanted", "error"),
+    [
+        ([1.0, -4.5], [1.0, -4.0], 0.125),
+        ([0.0, 0.0], [0.0, 0.0], 0.0),
+        ([1e-30, 0.0], [0.0, 0.0], math.inf),
+        ([math.nan, 1.0], [1.0, 1.0], math.inf),
+        ([math.inf, 1.0], [1.0, 1.0], math.inf),
+        ([], [], 0.0),
+    ],
+)
+def test_relative_error(got: list[float], wanted: list[float], error: float) -> None:
+    assert relative_error(torch.tensor(got), torch.tensor(wanted)) == error
+
+
+# ---------------------------------------------------------------- inputs
+
+
+@pytest.mark.parametrize("case", cases(), ids=lambda case: case.name)
+def test_float32_holds_every_input(case: Case) -> None:
+    for value in case.inputs.values():
+        assert value.dtype == torch.float64 and torch.equal(value, value.float().double())
+
+
+@pytest.mark.parametrize("wanted", [0.5, 1.8, 8.0, 100.0])
+def test_radii_keep_clear_of_pixel_centres(wanted: float) -> None:
+    points_uv = torch.rand(50, 2).double() * torch.tensor([52, 36])
+    radii = clear_radii(points_uv, wanted, *SIZE)
+    y, x = torch.meshgrid(torch.arange(36) + 0.5, torch.arange(52) + 0.5, indexing="ij")
+    distances = (torch.stack([x, y], -1).reshape(-1, 1, 2) - points_uv).norm(dim=-1)
+    assert (distances / radii - 1).abs().min() > 1e-4
+    assert ((radii / wanted - 1).abs() <= 0.15).all()
+
+
+def test_a_view_is_where_its_radii_were_chosen() -> None:
+    """The operators' places are those that radii keep clear for."""
+    seen: list[torch.Tensor] = []
+
+    def looking(points_uv: torch.Tensor, *others: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        seen.append(points_uv.detach()[0])
+        return OPERATORS.splat(points_uv, *others)
+
+    case = case_at("recursion", 5)
+    evaluate(case, with_splat(looking), torch.float64)
+    torch.testing.assert_close(seen[0], projected(case.inputs), rtol=1e-12, atol=1e-10)
+
+
+def test_layers_by_hand() -> None:
+    """Two points on 3 x 1 pixels: the far one comes first in memory and reaches all, the near one the middle alone."""
+    uv, z, radii = torch.tensor([[1.5, 0.5], [1.5, 0.5]]), torch.tensor([4.0, 2.0]), torch.tensor([2.0, 0.5])
+    layers = list_layers(uv, z, radii, 1, 3)
+    found = [sorted(zip(layers.pixels[s].tolist(), layers.points[s].tolist(), strict=True)) for s in layers.slices]
+    assert found == [[(0, 0), (1, 1), (2, 0)], [(1, 0)]]
+    assert sorted(layers.shapes.tolist()) == [0.75, 0.75, 1, 1]
+    assert sorted(layers.offsets[:, 0].tolist()) == [-1, 0, 0, 1] and not layers.offsets[:, 1].any()
+
+
+# ---------------------------------------------------------------- peers
+
+
+@pytest.mark.parametrize("name", ["dividing", "clamping"])
+def test_peers_splat_as_well_as_vestcl_where_nothing_is_opaque(name: str) -> None:
+    for case in (case_at("opacity", 0.5), case_at("layers", 100), case_at("size", 64)):
+        row = stability.measure_case(case)
+        assert not misses(row.peers[name], row.bounds)
+
+
+def test_a_dividing_backward_loses_what_is_behind_opaque_points() -> None:
+    """Its image is right, and the gradients that alpha's goes into are not; at 1 - 2^-24 already 1 in 100 is lost."""
+    opaque = stability.measure_case(case_at("opacity", 0))
+    assert not opaque.broken
+    assert not set(misses(opaque.peers["dividing"], opaque.bounds)) & {"image", "coverage", "features"}
+    assert opaque.peers["dividing"].gradients["opacities"] > 0.5
+    nearly = stability.measure_case(case_at("opacity", 2.0**-24))
+    assert not nearly.broken and nearly.peers["dividing"].gradients["opacities"] > 5e-3
+
+
+def test_clamping_changes_the_image() -> None:
+    row = stability.measure_case(case_at("opacity", 0))
+    assert 1e-3 < row.peers["clamping"].outputs["image"] < 2e-2
+    assert row.peers["clamping"].gradients["opacities"] > 1e-3
+    assert "backgrounds" not in row.peers["clamping"].gradients
+
+
+def test_pytorch3d_gets_a_channel_for_coverage_and_a_background(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In its place, the twin without a background: what is passed on and put together must give vestcl's image."""
+
+    def stand_in(scene: Any, layers: int) -> torch.Tensor:
+        assert layers == len(list_layers(*of, scene.height, scene.width).slices)
+        looks = (scene.points_uv, scene.z, scene.radii, scene.opacities, scene.features)
+        return reference.splat(*looks, scene.height, scene.width)[0]
+
+    monkeypatch.setattr(_stability_peers._pytorch3d, "is_installed", lambda: True)
+    monkeypatch.setattr(_stability_peers._pytorch3d, "splat", stand_in)
+    case = case_at("radius", 1.5)
+    of = [case.inputs[name][0].float() for name in ("points_uv", "z", "radii")]
+    row = stability.measure_case(case)
+    assert list(row.peers) == ["dividing", "clamping", "PyTorch3D"]
+    assert not misses(row.peers["PyTorch3D"], row.bounds)
+
+
+# ---------------------------------------------------------------- the command
+
+
+def test_a_run_writes_and_prints_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = {name: tmp_path / "new" / f"stability.{name}" for name in ("json", "markdown")}
+    config = StabilityBench(quick=True, families=("opacity", "angle"), plots=tmp_path / "plots", **files)
+    assert stability.main(config) == 0
+    printed, content = capsys.readouterr().out, json.loads(files["json"].read_text(encoding="utf-8"))
+    rows = content["devices"][0]["details"]["rows"]
+    assert [(row["family"], row["knob"]) for row in rows] == [(c.family, c.knob) for c in cases("opacity", "angle")]
+    for row in rows:
+        assert row["kept"] and row["broken"] == []
+        for kind in ("outputs", "gradients"):
+            assert row["errors"][kind].keys() == row["bounds"][kind].keys()
+        assert set(row["peers"]) == ({"dividing", "clamping"} if row["family"] == "opacity" else {"R x + t - x"})
+    loaded = _results.load(files["json"])
+    assert len(loaded) == 1 and [m.name for m in loaded[0].measures] == [
+        f"{row['family']} {row['knob']:g}, {kind}" for row in rows for kind in ("output", "gradient")
+    ]
+    markdown = files["markdown"].read_text(encoding="utf-8")
+    for text in ("opacity: relative error", "angle: relative error", "dividing gradient", "kept"):
+        assert text in markdown
+    assert "all bounds kept in 5 cases" in printed
+    assert [path.suffix for path in (tmp_path / "plots").iterdir()] == [".png"]
+    assert next((tmp_path / "plots").iterdir()).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_broken_bound_is_told_and_counts(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def nothing_allowed(case: Case, truth: Any) -> Bounds:
+        return Bounds(dict.fromkeys(truth.outputs, 0.0), dict.fromkeys(truth.gradients, 1.0))
+
+    monkeypatch.setattr(stability, "bounds_of", nothing_allowed)
+    assert stability.main(StabilityBench(quick=True, families=("angle",), peers=False)) == 1
+    printed = capsys.readouterr().out
+    assert "bound broken: angle 1e-06: displacement_xyz" in printed and "grad_" not in printed
+
+
+def test_an_error_that_is_no_number_breaks_a_bound() -> None:
+    row = stability.Row("depth", 1.0, Errors({"image": 0.0}, {"depth": math.nan}), Bounds({"image": 0}, {"depth": 1}))
+    assert row.broken == ["grad_depth"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [("families", ("depths",), "`families` must be of depth, .*, got depths"), ("threads", 0, "`threads` .* got 0")],
+)
+def test_what_it_refuses(name: str, value: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        stability.main(StabilityBench(quick=True, **{name: value}))
+
+
+def test_without_float64_there_is_no_truth(monkeypatch: pytest.MonkeyPatch, session: runtime.Session) -> None:
+    info = dataclasses.replace(session.info, float64=False)
+    monkeypatch.setattr(session, "info", info)
+    monkeypatch.setattr(runtime, "select", lambda: info)
+    monkeypatch.setattr(runtime, "devices", lambda: [info])
+    with pytest.raises(runtime.DeviceError, match="no OpenCL device has float64"):
+        stability.measure_case(case_at("angle", 1e-6))
