@@ -12,7 +12,7 @@ from vestcl import __version__, runtime
 from vestcl.data.calibration import translation
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageArray
-from vestcl.forecast import Forecast, Rendered, View
+from vestcl.forecast import Forecast, Rendered, Skipped, View
 from vestcl.forecast_files import Details, machine, read_forecast, write_forecast
 from vestcl.io.images import to_float
 from vestcl.io.video import Video
@@ -81,6 +81,24 @@ def test_round_trip(tmp_path: Path) -> None:
     assert about["seconds"]["write the files"] > 0
     with Image.open(tmp_path / about["views"]["right"]["sheet"]) as picture:
         assert np.array_equal(np.asarray(picture), sheet)
+
+
+def test_what_a_network_skipped_is_told(tmp_path: Path) -> None:
+    clip = make_clip()
+    views = parse_views(["source"], clip)
+    skipped = {"seen": Skipped(1, 2, "frames", 0.25), "covered": Skipped(9000, 10_000, "points", None)}
+    forecast = replace(make_forecast(views), profile={"encode": 0.5}, skipped=skipped)
+    write_forecast(tmp_path, forecast, clip, 1, views, Details(""))
+    about = read_forecast(tmp_path).about
+    assert about["profile"] == {"encode": 0.5}
+    assert about["skipped"] == {
+        "seen": {"skipped": 1, "of": 2, "unit": "frames", "saved_seconds": 0.25, "share": 0.5},
+        "covered": {"skipped": 9000, "of": 10_000, "unit": "points", "saved_seconds": None, "share": 0.9},
+    }
+    told = [str(Skipped(**{key: one[key] for key in Skipped._fields})) for one in about["skipped"].values()]
+    assert told == ["50 % of 2 frames, about 0.25 s", "90 % of 10,000 points"]
+    write_forecast(tmp_path, make_forecast(views), clip, 1, views, Details(""))
+    assert not {"profile", "skipped"} & set(read_forecast(tmp_path).about)
 
 
 def test_every_file_that_is_told_exists_and_no_other(tmp_path: Path) -> None:

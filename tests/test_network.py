@@ -10,12 +10,14 @@ from forecaster_scenes import SMALL, TINY, stir
 
 from vestcl.data import Street
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, View
+from vestcl.forecast import Forecast, Skipped, View
 from vestcl.geometric import Perception
 from vestcl.models.forecaster import Forecaster
-from vestcl.network import forecast_clip, forecast_frames
+from vestcl.models.skipping import Count, Tally
+from vestcl.network import forecast_clip, forecast_frames, what_was_skipped
 from vestcl.network_input import last_motions, network_input
 from vestcl.prepared import prepare_frame
+from vestcl.stages import REST, STAGES
 
 HEIGHT, WIDTH = 48, 160
 RIGHT = np.eye(4)
@@ -78,6 +80,50 @@ def test_it_is_the_models_own_forecast(start: str, mode: Any) -> None:
             assert np.array_equal(rendered.image, view.image[0].clamp(0, 1).numpy())
         assert np.allclose(future, step.future_from_cur[0].numpy()) and future.dtype == np.float64
     assert result.method == network.config.name and result.seconds["network"] > 0
+
+
+def test_a_forecast_tells_its_stages_and_what_it_skipped() -> None:
+    """Of this forecast alone; the model is as it was."""
+    network = model()
+    views = [*VIEWS, View("again", np.eye(4))]
+    first = forecast_frames(perception(), network, 2, 1, views)
+    again = forecast_frames(perception(), network, 2, 1, views)
+    assert not {*STAGES} & {*vars(network)}
+    for result, known in ((first, 0), (again, 2)):
+        assert list(result.profile) == [*STAGES.values(), REST]
+        assert sum(result.profile.values()) == pytest.approx(result.seconds["network"], rel=1e-6)
+        assert result.profile["refine"] > 0
+        assert result.skipped["seen"][:3] == (known, 2, "frames")
+        assert result.skipped["views"][:3] == (1, 3, "views")
+        assert result.skipped["views"].share == pytest.approx(1 / 3)
+    shown = first.profile["splat"] + first.profile["refine"]
+    assert first.skipped["views"].saved_seconds == pytest.approx(shown / 2)
+    assert first.skipped["seen"].saved_seconds == 0 and again.skipped["seen"].saved_seconds is None
+    for name in ("image", "depth"):
+        assert np.array_equal(getattr(first.frames[0]["again"], name), getattr(first.frames[0]["source"], name))
+
+
+def test_what_skipping_saved_by_hand() -> None:
+    """As long as what was computed of the same took: 30 px of a frame, 10 of its background in 4 s; 3 s two views."""
+    profile = {"encode": 4.0, "EMF": 9.0, "OMF": 6.0, "lift": 9.0, "splat": 1.0, "refine": 2.0}
+    counts = {
+        "seen": Count(1, 2, "frames"),
+        "background": Count(20, 30, "px"),
+        "objects": Count(10, 30, "px"),
+        "covered": Count(7, 9, "points"),
+        "views": Count(0, 2, "views"),
+    }
+    found = what_was_skipped(Tally(counts), profile)
+    assert found == {
+        "seen": Skipped(1, 2, "frames", 4.0),
+        "background": Skipped(20, 30, "px", 2.0),
+        "objects": Skipped(10, 30, "px", 3.0),
+        "covered": Skipped(7, 9, "points", None),
+        "views": Skipped(0, 2, "views", 0.0),
+    }
+    empty = what_was_skipped(Tally({name: Count(count.of, *count[1:]) for name, count in counts.items()}), profile)
+    assert empty["background"].saved_seconds == 4.0
+    assert empty["objects"].saved_seconds is None and empty["views"].saved_seconds is None
 
 
 def test_a_view_may_have_a_camera_of_its_own() -> None:

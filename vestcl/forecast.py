@@ -1,6 +1,7 @@
 """What any forecast gives, whoever makes it: images of future frames from the cameras that were asked for."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,27 @@ class Rendered:
     its own time's source camera; 0 where unknown."""
 
 
+class Skipped(NamedTuple):
+    """What a network did not compute, because the scene did not need it."""
+
+    skipped: int
+    of: int
+    unit: str
+    saved_seconds: float | None
+    """Estimated: as long as what was computed of the same took in the same forecast; None where nothing was, or where
+    time does not go with it."""
+
+    @property
+    def share(self) -> float:
+        """skipped / of."""
+        return self.skipped / self.of if self.of else 0.0
+
+    def __str__(self) -> str:
+        """ "73 % of 425,984 px, about 0.05 s"."""
+        saved = "" if self.saved_seconds is None else f", about {self.saved_seconds:.2f} s"
+        return f"{100 * self.share:.0f} % of {self.of:,} {self.unit}{saved}"
+
+
 @dataclass(frozen=True, eq=False)
 class Forecast:
     """The frames at t+1, t+2, ... from every view."""
@@ -43,3 +65,7 @@ class Forecast:
     """Per step, by the view's name."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time by stage."""
+    profile: dict[str, float] = field(default_factory=dict)
+    """A network's seconds by stage; they are in ``seconds``, too, as one number."""
+    skipped: dict[str, Skipped] = field(default_factory=dict)
+    """By switch of `vestcl.models.skipping.Skip`."""

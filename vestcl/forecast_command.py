@@ -16,11 +16,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from vestcl import compare, forecast_files, pretrained, runtime, sheet
+from vestcl import compare, forecast_files, pretrained, quality, runtime, sheet
 from vestcl.compare import Comparison
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, View
+from vestcl.forecast import Forecast, Skipped, View
 from vestcl.models.trunks import load_trunk
 from vestcl.views import parse_views
 
@@ -85,7 +85,8 @@ def run(options: "cli.Forecast") -> None:
     with runtime.use(options.device), bar:
         stages = _Stages(bar)
         with stages.stage("open the clip"):
-            model = None if options.model is None else pretrained.load_model(options.model)
+            level = options.quality or quality.USUAL
+            model = None if options.model is None else quality.apply(pretrained.load_model(options.model), level)
             clip = open_clip(options)
             index = current_frame(clip, options)
             views = parse_views(options.view or ("source",), clip[index])
@@ -162,6 +163,8 @@ def _check(options: "cli.Forecast") -> None:
         raise ValueError("`squeeze` is a distance to the truth; it needs `compare`")
     if options.mode is not None and options.model is None:
         raise ValueError("`mode` is how a network goes on after its first step; it needs `model`")
+    if options.quality is not None and options.model is None:
+        raise ValueError("`quality` is how exactly a network computes; it needs `model`")
 
 
 def _street(seed: int, options: "cli.Forecast") -> Clip:
@@ -242,7 +245,8 @@ def _details(
     scores = {name: comparison.scores for name, comparison in compared.items()} if options.compare else None
     settings = dataclasses.asdict(options)
     if options.model is not None:
-        settings |= {"mode": options.mode or USUAL_MODE, **pretrained.about_model(options.model)}
+        chosen = {"mode": options.mode or USUAL_MODE, **quality.about(options.quality or quality.USUAL)}
+        settings |= chosen | pretrained.about_model(options.model)
     return forecast_files.Details(options.input, settings, scores, sheets)
 
 
@@ -277,6 +281,11 @@ def _print_end(console: Console, saved: forecast_files.SavedForecast) -> None:
     for name, value in (seconds | {"all": sum(seconds.values())}).items():
         table.add_row(name, f"{value:.2f}")
     console.print(table)
+    for switch, one in saved.about.get("skipped", {}).items():
+        if one["skipped"]:
+            console.print(
+                Text(f"skipped, {switch}: {Skipped(*(one[name] for name in Skipped._fields))}"), soft_wrap=True
+            )
     for view in saved.about["views"].values():
         for path in _paths(view):
             console.print(Text(str(saved.folder / path)), soft_wrap=True)

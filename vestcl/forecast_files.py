@@ -263,6 +263,10 @@ def _about(forecast: Forecast, clip: Clip, index: int, details: Details) -> dict
         "settings": dict(details.settings),
         **machine(),
     }
+    if forecast.profile:
+        about["profile"] = forecast.profile
+    if forecast.skipped:
+        about["skipped"] = {switch: one._asdict() | {"share": one.share} for switch, one in forecast.skipped.items()}
     return about if details.scores is None else about | {"scores": details.scores}
 
 

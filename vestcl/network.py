@@ -1,18 +1,20 @@
 """Forecasts by a trained network, asked for and answered as those of `vestcl.geometric` are."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, Rendered, View
+from vestcl.forecast import Forecast, Rendered, Skipped, View
 from vestcl.geometric.perception import Perception
 from vestcl.models.forecaster import Forecaster, Mode, RenderedView
+from vestcl.models.skipping import Count, Tally
 from vestcl.network_input import NetworkInput, last_motions, network_input
 from vestcl.prepared import prepare_frame
+from vestcl.stages import watching, with_rest
 
 Progress = Callable[[str, float], None]
 
@@ -88,8 +90,8 @@ def forecast_frames(
         raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
     given = _given(perception, index)
     tell("network")
-    start = time.perf_counter()
-    with torch.inference_mode():
+    start, model.tally = time.perf_counter(), Tally()
+    with torch.inference_mode(), watching(model) as watch:
         done = model.forecast(
             given.frame_prev, given.frame_cur, given.K, steps, cameras(views, given), mode,
             prior=given.prior if model.config.start == "prior" else None,
@@ -97,8 +99,34 @@ def forecast_frames(
     names = [view.name for view in views]
     frames = [dict(zip(names, map(_rendered, step.views), strict=True)) for step in done]
     motions = [step.future_from_cur[0].double().numpy() for step in done]
-    seconds = perception.seconds | {"network": time.perf_counter() - start}
-    return Forecast(model.config.name, motions, frames, seconds)
+    whole = time.perf_counter() - start
+    profile = with_rest(watch.take(), whole)
+    skipped = what_was_skipped(model.tally, profile)
+    return Forecast(model.config.name, motions, frames, perception.seconds | {"network": whole}, profile, skipped)
+
+
+def what_was_skipped(tally: Tally, profile: Mapping[str, float]) -> dict[str, Skipped]:
+    """Counters with what they saved: t n_skipped / n_computed, t of the stage that would have done it.
+
+    Encoding a frame and its background counts as encoding as many pixels; a view is splatted and refined. What a point
+    costs the splatter depends on where it is, so there is no estimate of "covered"; nor is there one where nothing of
+    the kind was computed, and so nothing timed.
+
+    Args:
+        tally: of a forecast.
+        profile: seconds by stage, of the same one.
+
+    Returns:
+        By switch.
+    """
+    of_view, pixels = profile["splat"] + profile["refine"], tally.counts.get("background", Count(0, 0, "px"))
+    timed = {"seen": profile["encode"], "background": profile["encode"], "objects": profile["OMF"], "views": of_view}
+    skipped = {}
+    for switch, count in tally.counts.items():
+        computed = count.of - count.skipped + (pixels.of if switch == "background" else 0)
+        saved = timed[switch] * count.skipped / computed if switch in timed and computed else None
+        skipped[switch] = Skipped(*count, saved)
+    return skipped
 
 
 def show_frame(perception: Perception, model: Forecaster, index: int, views: Sequence[View]) -> dict[str, Rendered]:

@@ -47,6 +47,8 @@ class Street:
     """Unit vector towards it."""
     drive: Drive
     """How the camera moves, and with it the cars of its lane."""
+    crowded: bool = False
+    """As many cars in both lanes as fit, and more people: with a slow ``drive``, a jam."""
 
     @classmethod
     def generate(cls, seed: int, trajectory: ArrayLike | None = None) -> "Street":
@@ -235,4 +237,4 @@ class Street:
         return Layout(self.seed, self.kerb, self.pavement)
 
     def _traffic(self) -> Traffic:
-        return Traffic(self._plan(), self.lane, self.drive)
+        return Traffic(self._plan(), self.lane, self.drive, self.crowded)

@@ -23,6 +23,12 @@ LEAD: Final = 1.3
 #: ... beyond these metres at standstill, which with the slots' spread leave 2 m from bumper to bumper.
 QUEUE_SPACING: Final = 14.0
 
+#: Metres between cars in a crowd, which with the slots' spread leave none inside another, ...
+CROWD_SPACING: Final = 9.0
+
+#: ... and how many times as many people walk.
+CROWD_WALKERS: Final = 3.0
+
 #: A slot's number fits so many bits of an instance, its file's tag comes above: 8 million slots to either side.
 SLOT_BITS: Final = 24
 
@@ -52,6 +58,8 @@ class Traffic:
     """Width of each of the two lanes, metres."""
     drive: Drive
     """The camera's."""
+    crowded: bool = False
+    """As many cars in both lanes as fit, and more people."""
 
     def movers(self, t: float, low: float, high: float) -> Iterator[Mover]:
         """Those between z = ``low`` and ``high`` metres at ``t`` seconds."""
@@ -85,11 +93,13 @@ class Traffic:
 
     def _files(self) -> tuple[File, ...]:
         walk = self.plan.kerb + self.plan.pavement
+        queue, oncoming = (CROWD_SPACING, CROWD_SPACING) if self.crowded else (QUEUE_SPACING, 31.0)
+        closer = CROWD_WALKERS if self.crowded else 1.0
         return (
-            File(1, "car", self.lane / 2, self.drive.speed, QUEUE_SPACING, gap=0),
-            File(2, "car", -self.lane / 2, -0.9 * self.drive.speed, 31.0),
-            File(3, "pedestrian", walk - 0.8, 1.3, 17.0),
-            File(4, "pedestrian", walk - 1.6, -1.2, 23.0),
-            File(5, "pedestrian", 0.8 - walk, -1.35, 19.0),
-            File(6, "pedestrian", 1.6 - walk, 1.25, 29.0),
+            File(1, "car", self.lane / 2, self.drive.speed, queue, gap=0),
+            File(2, "car", -self.lane / 2, -0.9 * self.drive.speed, oncoming),
+            File(3, "pedestrian", walk - 0.8, 1.3, 17.0 / closer),
+            File(4, "pedestrian", walk - 1.6, -1.2, 23.0 / closer),
+            File(5, "pedestrian", 0.8 - walk, -1.35, 19.0 / closer),
+            File(6, "pedestrian", 1.6 - walk, 1.25, 29.0 / closer),
         )

@@ -3,7 +3,7 @@
 Clouds of a batch differ in size, so they are packed: image b owns the points starts[b]:starts[b + 1].
 """
 
-import functools
+import bisect
 from typing import NamedTuple
 
 import torch
@@ -11,9 +11,18 @@ from torch.nn import functional
 
 from vestcl import geometry
 from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
+from vestcl.models._layers import side_by_side
 from vestcl.models.ego_motion import RigidMotion
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
+
+
+class Grid(NamedTuple):
+    """The points start ... start + height width - 1 are a picture's pixels, row after row."""
+
+    start: int
+    height: int
+    width: int
 
 
 class Cloud(NamedTuple):
@@ -33,9 +42,8 @@ class Cloud(NamedTuple):
     """[P, 1]: 1 on the static background."""
     inpainted: torch.Tensor
     """bool [P]: what no frame has seen."""
-    beside: torch.Tensor
-    """int64 [P, 4]: which points are to the left, to the right, above and below in the frame that they come from; where
-    there is none, and for inpainted points, the point itself."""
+    grids: tuple[Grid, ...]
+    """Which points are all the pixels of a frame. Others, as inpainted ones, have no neighbours."""
     starts: torch.Tensor
     """int64 [B + 1]."""
 
@@ -45,8 +53,7 @@ class Cloud(NamedTuple):
 
     def picked(self, points: torch.Tensor, starts: torch.Tensor) -> "Cloud":
         """Some points alone, by their rising indices [Q]; ``starts`` [B + 1] among those. They have no neighbours."""
-        alone = torch.arange(len(points))[:, None].expand(-1, 4)
-        return Cloud._make([*(tensor.index_select(0, points) for tensor in self[:-2]), alone, starts])
+        return Cloud._make([*(tensor.index_select(0, points) for tensor in self[:-2]), (), starts])
 
 
 def as_points(image: torch.Tensor) -> torch.Tensor:
@@ -74,17 +81,20 @@ def lift(frame: EncodedFrame, flow: torch.Tensor, flow0: torch.Tensor, intervals
     """
     layers = frame.layers
     batch, _, height, width = layers.image.shape
-    moving = as_points(torch.cat([flow, (flow - flow0) / intervals, frame.features, layers.image], dim=1)).flatten(0, 1)
     starts = torch.arange(batch + 1) * (height * width)
+
+    def points(*images: torch.Tensor) -> torch.Tensor:
+        return as_points(side_by_side(images)).flatten(0, 1)
+
     return Cloud(
         unproject(layers.depth, K).flatten(0, 1),
-        moving[:, :3],
-        moving[:, 3:6],
+        points(flow),
+        points((flow - flow0) / intervals),
         layers.depth.flatten(),
-        moving[:, 6:],
+        points(frame.features, layers.image),
         layers.mask.reshape(-1, 1),
         torch.zeros(batch * height * width, dtype=torch.bool),
-        _neighbours(height, width).repeat(batch, 1) + starts[:-1].repeat_interleave(height * width)[:, None],
+        tuple(Grid(start, height, width) for start in starts[:-1].tolist()),
         starts,
     )
 
@@ -104,7 +114,7 @@ def lift_hidden(frame: EncodedFrame, to_next: RigidMotion, K: torch.Tensor) -> C
     hidden = (layers.mask < FOREGROUND_BELOW).flatten()
     where = hidden.nonzero()[:, 0]
     points = unproject(layers.background_depth, K)
-    shown = torch.cat([frame.background_features, layers.background_image], dim=1)
+    shown = side_by_side([frame.background_features, layers.background_image])
 
     def pick(points: torch.Tensor) -> torch.Tensor:
         return points.flatten(0, 1).index_select(0, where)
@@ -117,20 +127,9 @@ def lift_hidden(frame: EncodedFrame, to_next: RigidMotion, K: torch.Tensor) -> C
         pick(as_points(shown)),
         points.new_ones(len(where), 1),
         torch.ones(len(where), dtype=torch.bool),
-        torch.arange(len(where))[:, None].expand(-1, 4),
+        (),
         functional.pad(hidden.view(len(layers.mask), -1).sum(dim=1).cumsum(0), (1, 0)),
     )
-
-
-@functools.lru_cache(maxsize=4)
-def _neighbours(height: int, width: int) -> torch.Tensor:
-    """`Cloud.beside` of one image."""
-    place = torch.arange(height * width).view(height, width)
-    sides = [
-        torch.cat([place[:, :1], place[:, :-1]], dim=1), torch.cat([place[:, 1:], place[:, -1:]], dim=1),
-        torch.cat([place[:1], place[:-1]], dim=0), torch.cat([place[1:], place[-1:]], dim=0),
-    ]  # fmt: skip
-    return torch.stack(sides, dim=2).flatten(0, 1)
 
 
 def join(first: Cloud, second: Cloud) -> Cloud:
@@ -144,12 +143,13 @@ def join(first: Cloud, second: Cloud) -> Cloud:
         return torch.cat([piece for pair in pairs for piece in pair])
 
     packed = [alternate(one, other) for one, other in zip(first[:-2], second[:-2], strict=True)]
-    shifts = (
-        second.starts[:-1].repeat_interleave(first.starts.diff()),
-        first.starts[1:].repeat_interleave(second.starts.diff()),
-    )
-    beside = alternate(*(cloud.beside + shift[:, None] for cloud, shift in zip((first, second), shifts, strict=True)))
-    return Cloud._make([*packed, beside, first.starts + second.starts])
+    shifts = second.starts[:-1].tolist(), first.starts[1:].tolist()
+    grids = [
+        grid._replace(start=grid.start + shift[bisect.bisect_right(cloud.starts.tolist(), grid.start) - 1])
+        for cloud, shift in zip((first, second), shifts, strict=True)
+        for grid in cloud.grids
+    ]
+    return Cloud._make([*packed, tuple(grids), first.starts + second.starts])
 
 
 def advance(cloud: Cloud, next_from_cur: torch.Tensor) -> Cloud:

@@ -22,6 +22,12 @@ class Memory:
     def __init__(self) -> None:
         self._frames: deque[tuple[object, LayerBatch, EncodedFrame]] = deque(maxlen=_REMEMBERED)
 
+    def copy(self) -> "Memory":
+        """One that remembers the same, and forgets by itself."""
+        other = Memory()
+        other._frames.extend(self._frames)
+        return other
+
     def find(self, key: object, layers: LayerBatch) -> EncodedFrame | None:
         """What ``layers`` were encoded to, if they are among the last."""
         for known, seen, encoded in self._frames:

@@ -25,6 +25,7 @@ def move_objects(
     start: torch.Tensor,
     skip: Skip,
     tally: Tally,
+    blocks: int | None = None,
 ) -> ObjectMotionForecast:
     """OMF at full size, [B, 6, H, W] m in and out.
 
@@ -40,9 +41,12 @@ def move_objects(
         start: what OMF corrects.
         skip: with ``objects``, OMF runs around the foreground, if it is to move nothing else.
         tally: is told how much that left out.
+        blocks: only the first so many run; None is all.
     """
+    if blocks == 0:
+        return unmoved(start)
     moving = torch.cat([frame.layers.mask < FOREGROUND_BELOW for frame in (prev, cur)], dim=1)
-    found = _where(network, moving, skip, tally)
+    found = _where(network, moving, skip, tally, blocks)
     if not found:
         return unmoved(start)
     beyond = torch.cat([
@@ -56,7 +60,8 @@ def move_objects(
         *(frame.layers.mask for frame in (prev, cur)),
         near,
     ]
-    parts = [network(*map(box.cut, seen)) for box in found]
+    some = {} if blocks is None else {"blocks": blocks}
+    parts = [network(*map(box.cut, seen), **some) for box in found]
     moves = moving.repeat_interleave(3, dim=1) if network.config.where == "foreground" else None
 
     def whole(pieces: Iterable[torch.Tensor]) -> torch.Tensor:
@@ -65,17 +70,18 @@ def move_objects(
             box.cut(flow).copy_(piece)
         return flow + beyond if moves is None else torch.where(moves, flow + beyond, start)
 
-    candidates = [whole(pieces) for pieces in zip(*(part.candidates for part in parts), strict=True)]
+    learning = torch.is_grad_enabled()  # losses alone look at candidates
+    candidates = [whole(some) for some in zip(*(part.candidates for part in parts), strict=True)] if learning else []
     return parts[0]._replace(flow=whole(part.flow for part in parts), candidates=candidates)
 
 
-def _where(network: ObjectMotion, moving: torch.Tensor, skip: Skip, tally: Tally) -> list[Box]:
+def _where(network: ObjectMotion, moving: torch.Tensor, skip: Skip, tally: Tally, blocks: int | None) -> list[Box]:
     """The parts of the picture that OMF is to see; one alone where it chooses its blocks by the whole scene."""
     batch, _, height, width = moving.shape
     whole = Box(0, height, 0, width)
     if network.config.where == "everywhere" or not skip.objects:
         return [whole]
-    margin = network.reach if skip.margin is None else skip.margin
+    margin = network.reach_of(blocks) if skip.margin is None else skip.margin
     found = boxes(moving.flatten(0, 1).any(dim=0), margin, network.multiple)
     if network.routing is not None and found:
         found = [found[0].around(found[1:])]

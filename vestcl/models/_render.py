@@ -8,8 +8,8 @@ import torch
 from torch.nn import functional
 
 from vestcl import constants
-from vestcl.models._clouds import Cloud, last_motion
-from vestcl.models._layers import check
+from vestcl.models._clouds import Cloud, Grid, last_motion
+from vestcl.models._layers import check, side_by_side
 from vestcl.models.config import LEAST_COVERAGE, RenderConfig
 from vestcl.models.skipping import Tally
 from vestcl.ops.displace import displace
@@ -93,6 +93,7 @@ def splat_cloud(
     config: RenderConfig,
     height: int,
     width: int,
+    min_transmittance: float = 0.0,
     open_: torch.Tensor | None = None,
     tally: Tally | None = None,
 ) -> Side:
@@ -109,6 +110,7 @@ def splat_cloud(
         config: rho, the radius in source pixels.
         height: rows of the view.
         width: columns of the view.
+        min_transmittance: see `vestcl.splat`.
         open_: bool [B, 1, H, W], the pixels that count: others may be left empty. None is all.
         tally: is told how many points that left out; None leaves out none.
 
@@ -121,7 +123,7 @@ def splat_cloud(
     zoom_of_point = zoom.repeat_interleave(cloud.starts.diff())
     magnified, opacities = zoom_of_point * cloud.depth / near, torch.ones_like(z)
     if config.stretched:
-        stretch, opacities = _surface(points_uv.detach(), magnified.detach(), cloud.beside)
+        stretch, opacities = _surface(points_uv.detach(), magnified.detach(), cloud.grids)
         magnified = magnified * stretch
     radii = (config.rho * magnified).clamp(*RADIUS)
     order = z.detach()
@@ -135,11 +137,16 @@ def splat_cloud(
         cloud = cloud.picked(kept, starts)
         points_uv, order, near, radii, opacities = (t[kept] for t in (points_uv, order, near, radii, opacities))
     raster = rasterize(points_uv, order, radii, opacities, height, width, cloud_starts=starts)
-    image, coverage = composite(raster, torch.cat([cloud.shown, near.reciprocal()[:, None]], dim=1))
-    features, colour, inverse_depth = image.split([image.shape[1] - 4, 3, 1], dim=1)
     with torch.no_grad():
-        known = torch.cat([cloud.background, last_motion(cloud, next_from_cur) / near[:, None]], dim=1)
-        background, inverse_motion = composite(raster, known)[0].split([1, 3], dim=1)
+        known = cloud.background, last_motion(cloud, next_from_cur) / near[:, None]
+    shown = [cloud.shown, near.reciprocal()[:, None]]
+    separate = torch.is_grad_enabled()  # no gradient is to pass through what is known
+    image, coverage = composite(raster, torch.cat(shown if separate else [*shown, *known], 1), None, min_transmittance)
+    if separate:
+        with torch.no_grad():
+            more = composite(raster, torch.cat(known, 1), None, min_transmittance)[0]
+        image = torch.cat([image, more], dim=1)
+    features, colour, inverse_depth, background, inverse_motion = image.split([image.shape[1] - 8, 3, 1, 1, 3], dim=1)
     return Side(features, colour, coverage, inverse_depth, background, inverse_motion)
 
 
@@ -164,7 +171,7 @@ def _reaching(points_uv: torch.Tensor, radii: torch.Tensor, starts: torch.Tensor
 
 
 def _surface(
-    points_uv: torch.Tensor, magnified: torch.Tensor, beside: torch.Tensor
+    points_uv: torch.Tensor, magnified: torch.Tensor, grids: Sequence[Grid]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """How much farther apart than ``magnified`` a surface's points are, and which points still are of a surface.
 
@@ -174,18 +181,25 @@ def _surface(
     Args:
         points_uv: [P, 2] px.
         magnified: [P], size of a source pixel, px.
-        beside: `Cloud.beside`.
+        grids: `Cloud.grids`.
 
     Returns:
         Factor [P], 1 or more; opacity [P], 0 where a point had neighbours and none is near it any more.
     """
-    gap = torch.linalg.vector_norm(points_uv[beside] - points_uv[:, None], dim=2)
-    has_neighbour = beside != torch.arange(len(beside))[:, None]
-    together = has_neighbour & (gap < _TORN * magnified.clamp(min=1)[:, None])
-    nearer = torch.where(together, gap, torch.inf).unflatten(1, (2, 2)).amin(dim=2)
-    spacing = torch.where(nearer.isfinite(), nearer, 0).amax(dim=1)
-    opaque = together.any(dim=1) | ~has_neighbour.any(dim=1)
-    return (spacing / magnified.clamp(min=1e-6)).clamp(min=1), opaque.to(points_uv)
+    factor, opacity = torch.ones_like(magnified), torch.ones_like(magnified)
+    for start, height, width in grids:
+        own, size = slice(start, start + height * width), (height, width)
+        uv, pixel = points_uv[own].unflatten(0, size), magnified[own].unflatten(0, size)
+        limit, spacing = _TORN * pixel.clamp(min=1), torch.zeros_like(pixel)
+        together = torch.full_like(pixel, height * width == 1, dtype=torch.bool)
+        for axis, (before, after) in enumerate((((0, 0, 1, 0), (0, 0, 0, 1)), ((1, 0), (0, 1)))):
+            gap = torch.linalg.vector_norm(uv.diff(dim=axis), dim=2).nan_to_num(nan=torch.inf, posinf=torch.inf)
+            nearer = torch.minimum(*(functional.pad(gap, side, value=torch.inf) for side in (before, after)))
+            near = nearer < limit
+            spacing, together = spacing.maximum(torch.where(near, nearer, 0)), together | near
+        factor[own] = (spacing / pixel.clamp(min=1e-6)).clamp(min=1).flatten()
+        opacity[own] = together.flatten().to(opacity)
+    return factor, opacity
 
 
 def refined_channels(side: Side, colour: bool, normalised: bool) -> torch.Tensor:
@@ -197,7 +211,7 @@ def refined_channels(side: Side, colour: bool, normalised: bool) -> torch.Tensor
     planes = [side.features * per_coverage]
     if colour:
         planes += [side.colour * per_coverage, side.coverage, side.inverse_depth * per_coverage]
-    return torch.cat(planes, dim=1)
+    return side_by_side(planes)
 
 
 def compose_view(sides: Sequence[Side], image: torch.Tensor) -> RenderedView:
@@ -210,7 +224,7 @@ def compose_view(sides: Sequence[Side], image: torch.Tensor) -> RenderedView:
     Returns:
         The view; differentiable in colour, coverage, depth and image.
     """
-    behind, *fronts = (torch.cat(side[1:], dim=1) for side in sides)
+    behind, *fronts = (side_by_side(side[1:]) for side in sides)
     for front in fronts:
         behind = front + (1 - front[:, 3:4]) * behind
     colour, coverage, inverse_depth, background, inverse_motion = behind.split([3, 1, 1, 1, 3], dim=1)

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models._layers import channels_last, check, group_norm, upsample
+from vestcl.models._layers import channels_last, check, group_norm, side_by_side, upsample
 from vestcl.models._norm import Normalise, own
 from vestcl.models._weights import read_state_dict
 from vestcl.models.config import ENCODER_GROUP, EncoderConfig
@@ -77,9 +77,9 @@ class Encoder(nn.Module):
         at8 = self.layer2(at4, norm)
         at16 = self.layer3(at8, norm)
         up = self.up2(upsample(at16, 2, *at8.shape[-2:]), norm)
-        up = self.join2(torch.cat([up, at8], dim=1), norm)
+        up = self.join2(side_by_side([up, at8]), norm)
         up = self.up1(upsample(up, 2, *at4.shape[-2:]), norm)
-        up = self.join1(torch.cat([up, at4], dim=1), norm)
+        up = self.join1(side_by_side([up, at4]), norm)
         return self.out(up)
 
 

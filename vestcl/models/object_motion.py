@@ -7,7 +7,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models._layers import channels_last, check, frame_pair, upsample
+from vestcl.models._layers import channels_last, check, frame_pair, side_by_side, upsample
 from vestcl.models.config import ObjectMotionConfig, RoutingConfig
 
 #: Motion of both frames to t + 1: xyz of the previous one, xyz of the current one.
@@ -65,6 +65,7 @@ class ObjectMotion(nn.Module):
         mask_prev: torch.Tensor,
         mask_cur: torch.Tensor,
         flow0: torch.Tensor,
+        blocks: int | None = None,
     ) -> ObjectMotionForecast:
         """Forecast the motion of both frames' pixels. All arguments are at the image's size, whatever that is.
 
@@ -76,6 +77,7 @@ class ObjectMotion(nn.Module):
             mask_prev: [B, 1, H, W], 1 on the static background.
             mask_cur: the same at t.
             flow0: [B, 6, H, W] m, the rigid flow of both frames' pixels to t + 1.
+            blocks: only the first so many run, of those that routing chooses; None is all.
 
         Returns:
             The forecast; differentiable in all arguments.
@@ -86,25 +88,31 @@ class ObjectMotion(nn.Module):
         pair = frame_pair(features_prev, features_cur, depth_prev, depth_cur, mask_prev, mask_cur, self.features)
         batch, _, height, width = features_prev.shape
         check(flow0=(flow0, f"{batch} {MOTION_CHANNELS} {height} {width}"))
-        frames, flow = self._pad(torch.cat(pair, dim=1)), self._pad(flow0)
+        frames, flow = self._pad(side_by_side(pair)), self._pad(flow0)
         shrunk = {scale: shrink(frames, scale) for scale in set(self.scales)}
         if self.routing is None:
             probabilities, gates = None, flow.new_ones(len(flow), len(self.blocks))
         else:
             probabilities, gates = self.routing(shrunk[max(self.scales)])
-        flow, candidates = self._cascade(frames, shrunk, flow, gates)
+        if blocks is not None:
+            gates = gates * (torch.arange(gates.shape[1]) < blocks)
+        flow, candidates = self._cascade(frames, shrunk, flow, gates[:, :blocks])
         cut = [candidate[..., :height, :width] for candidate in candidates]
         return ObjectMotionForecast(flow[..., :height, :width], cut, gates.detach().bool(), probabilities)
 
     @property
     def reach(self) -> int:
-        """Pixels beyond a pixel that its motion may depend on: what the blocks reach, added up.
+        """`reach_of` all blocks."""
+        return self.reach_of(None)
+
+    def reach_of(self, blocks: int | None) -> int:
+        """Pixels beyond a pixel that its motion may depend on: what the first ``blocks`` (None: all) reach, added up.
 
         A conv on cells of s pixels reaches s further, and so does bilinear resizing to or from them; and a cell of a
         stride begins up to a cell before the pixel.
         """
         of_block = (lambda s: 28 * s + 2) if self.config.shape == "dmvfn" else (lambda s: 8 * s + 1)
-        return sum(map(of_block, self.scales))
+        return sum(map(of_block, self.scales[:blocks]))
 
     @property
     def learns(self) -> bool:
@@ -124,7 +132,7 @@ class ObjectMotion(nn.Module):
     ) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """All blocks in turn; outside training, each for the samples that chose it."""
         candidates = []
-        for block, scale, gate in zip(self.blocks, self.scales, gates.unbind(1), strict=True):
+        for block, scale, gate in zip(self.blocks, self.scales, gates.unbind(1), strict=False):
             if self.training or self.routing is None:
                 residual = block(frames, shrunk[scale], flow)
                 candidates.append(flow + residual)
@@ -190,7 +198,7 @@ class MotionBlock(nn.Module):
         coarse = self.down(self.shrunk_act(self.shrunk_in(shrunk, shrink(flow, self.scale))))
         coarse = self.squeeze(self.inner(coarse) + coarse)
         full = self.full(self.full_act(self.full_in(frames, flow)))
-        return self.out(torch.cat([upsample(coarse, self.up, *full.shape[-2:]), full], dim=1))
+        return self.out(side_by_side([upsample(coarse, self.up, *full.shape[-2:]), full]))
 
 
 class MotionConv(nn.Conv2d):

@@ -4,7 +4,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models._layers import channels_last, check, group_norm, upsample
+from vestcl.models._layers import channels_last, check, group_norm, side_by_side, upsample
 from vestcl.models.config import LEAST_COVERAGE, OPAQUE, REFINE_GROUP, RefineConfig, RenderConfig
 
 
@@ -69,13 +69,13 @@ class Refine(nn.Module):
         levels.pop()
         for up in self.ups:
             x = up(x, *levels.pop())
-        y = self.out(torch.cat([stem, upsample(x, 2, *stem.shape[-2:])], dim=1))
+        y = self.out(side_by_side([stem, upsample(x, 2, *stem.shape[-2:])]))
         if self.base == "none":
             return y.sigmoid()
-        image = self._base(rendered) + y
+        image = self.base_image(rendered) + y
         return image if self.training else image.clamp(0, 1)
 
-    def _base(self, rendered: torch.Tensor) -> torch.Tensor:
+    def base_image(self, rendered: torch.Tensor) -> torch.Tensor:
         """b of the class's formula, [B, 3, H, W]."""
         image, opacity = torch.zeros_like(rendered[:, :3]), torch.zeros_like(rendered[:, :1])
         for side in rendered.chunk(1 if self.render.joint else 2, dim=1):
@@ -133,8 +133,8 @@ class Up(nn.Module):
     def forward(self, x: torch.Tensor, level_first: torch.Tensor, level_second: torch.Tensor) -> torch.Tensor:
         """[B, channels_in, h, w] and two [B, channels_in, H, W] of twice that size -> [B, channels, H, W]."""
         x = upsample(x, 2, *level_second.shape[-2:])
-        x = self.first(torch.cat([level_second, x], dim=1))
-        return self.second(torch.cat([level_first, x], dim=1))
+        x = self.first(side_by_side([level_second, x]))
+        return self.second(side_by_side([level_first, x]))
 
 
 def _conv(channels_in: int, channels: int) -> nn.Sequential:

@@ -1,0 +1,127 @@
+"""The knobs of a forecast, and the values that each is swept over."""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+from vestcl.models.effort import Effort
+from vestcl.models.forecaster import Forecaster
+from vestcl.models.skipping import NOTHING, Skip
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a forecast is computed."""
+
+    skip: Skip = field(default_factory=Skip)
+    effort: Effort = field(default_factory=Effort)
+    autocast: str | None = None
+    """"bfloat16", of encoder and refinement; None is the parameters' own float32."""
+    size: float = 1.0
+    """The whole forecast is made at this fraction of height and width, and enlarged."""
+
+    def plain(self) -> dict[str, Any]:
+        """What differs from the defaults, as JSON has it; `Setting.of` reads it."""
+        parts = {"skip": (self.skip, Skip()), "effort": (self.effort, Effort())}
+        changed: dict[str, Any] = {
+            name: {key: value for key, value in vars(own).items() if value != getattr(usual, key)}
+            for name, (own, usual) in parts.items()
+        }
+        changed |= {"autocast": self.autocast} if self.autocast else {}
+        changed |= {"size": self.size} if self.size != 1 else {}
+        return {name: value for name, value in changed.items() if value}
+
+    @classmethod
+    def of(cls, plain: dict[str, Any]) -> "Setting":
+        """The setting that `plain` told.
+
+        Raises:
+            TypeError: something else.
+        """
+        rest = {name: value for name, value in plain.items() if name not in ("skip", "effort")}
+        return cls(Skip(**plain.get("skip", {})), Effort(**plain.get("effort", {})), **rest)
+
+
+#: As a network is loaded: everything is exact.
+EXACT: Final = Setting()
+
+
+@dataclass(frozen=True)
+class Knob:
+    """One quantity, turned."""
+
+    name: str
+    about: str
+    """What the values are."""
+    values: tuple[tuple[str, Setting], ...]
+    """The default first."""
+
+
+def _efforts(name: str, values: Iterable[Any]) -> tuple[tuple[str, Setting], ...]:
+    return tuple((_text(value), Setting(effort=replace(Effort(), **{name: value}))) for value in values)
+
+
+def _text(value: Any) -> str:
+    return "all" if value is None else f"{value:g}"
+
+
+def knobs(model: Forecaster) -> list[Knob]:
+    """What can be turned in ``model``: all that its configuration has, with the values to try."""
+    found = [
+        Knob("skipping", "what changes nothing is left out", (
+            ("on", EXACT),
+            ("frames seen are encoded anew", Setting(Skip(seen=False))),
+            ("off", Setting(NOTHING)),
+        )),
+        Knob("min_transmittance", "points behind that are left out", _efforts(
+            "min_transmittance", (0.0, 0.001, 0.01, 0.03, 0.1, 0.3)
+        )),
+        Knob("splat_scale", "fraction of the view's size that clouds are splatted at", _efforts(
+            "splat_scale", (1.0, 0.75, 0.5)
+        )),
+        Knob("precision", "of encoder and refinement", (
+            ("float32", EXACT), ("bfloat16", Setting(autocast="bfloat16"))
+        )),
+        Knob("image size", "fraction of the size that all is computed at", tuple(
+            (_text(size), Setting(size=size)) for size in (1.0, 0.75, 0.5)
+        )),
+    ]  # fmt: skip
+    config = model.config
+    if config.refine.base != "none":
+        about = "fraction of the view's size that refinement is computed at"
+        found.append(Knob("paint_scale", about, _efforts("paint_scale", (1.0, 0.75, 0.5, 0.25))))
+    if config.object_motion is not None:
+        count = len(config.object_motion.scales)
+        about = f"the first of {count} blocks of object motion"
+        found.append(Knob("blocks", about, _efforts("blocks", (None, *range(count - 1, -1, -1)))))
+    if config.encoder.background == "frame" or (config.object_motion and config.object_motion.where == "foreground"):
+        values = tuple((f"{_text(m)}", Setting(Skip(margin=m))) for m in (None, 128, 64, 32, 16, 0))
+        found.append(Knob("margin", "pixels around the foreground that are computed with it", values))
+    return found
+
+
+def combined(settings: Sequence[Setting]) -> Setting:
+    """All that ``settings`` change, at once; where two change the same, the last one counts."""
+    result = EXACT
+    for setting in settings:
+        parts = {name: replace(getattr(result, name), **setting.plain().get(name, {})) for name in ("skip", "effort")}
+        result = replace(
+            result, **parts,
+            autocast=setting.autocast or result.autocast,
+            size=setting.size if setting.size != 1 else result.size,
+        )  # fmt: skip
+    return result
+
+
+def combinations(choices: Sequence[Sequence[Setting]]) -> list[Setting]:
+    """Every way to take one of each of ``choices``, without repetition, in order."""
+    return list(dict.fromkeys(combined(chosen) for chosen in itertools.product(*choices)))
+
+
+def describe(setting: Setting) -> str:
+    """What differs from the defaults, in short."""
+    plain = setting.plain()
+    flat = plain.pop("skip", {}) | plain.pop("effort", {}) | plain
+    words = (f"{name} {value if isinstance(value, str) else _text(value)}" for name, value in flat.items())
+    return ", ".join(words) or "exact"

@@ -1,0 +1,97 @@
+"""What the Pareto bench forecasts: procedural streets, known up to frame t, with the frames that really follow."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import torch
+from torch.nn import functional
+
+from vestcl import geometry
+from vestcl.data import Street
+from vestcl.geometric import Perception
+from vestcl.models.effort import enlarged, fraction, reduced
+from vestcl.models.ego_motion import RigidMotion
+from vestcl.models.prior import MotionPrior
+from vestcl.network_input import NetworkInput, last_motions, network_input
+from vestcl.prepared import prepare_frame
+from vestcl.scene.layers import LayerBatch
+
+#: The current frame t: t - 2 and t - 1 before it tell how the camera's motion changes.
+CURRENT: Final = 2
+
+#: Seconds into the drive: an oncoming car is near.
+START: Final = 0.7
+
+#: Rays a pixel and direction: pictures as a camera's, without jagged edges.
+SAMPLES: Final = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One street."""
+
+    seed: int
+    given: NetworkInput
+    truth: torch.Tensor
+    """[steps, 3, H, W] in [0, 1]: the frames at t + 1, t + 2, ..."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) px."""
+        return self.truth.shape[2], self.truth.shape[3]
+
+
+def scene(seed: int, height: int, width: int, steps: int) -> Scene:
+    """A street's frames with true depth and labels, understood as `vestcl forecast` does, and the frames after them.
+
+    Args:
+        seed: of the street.
+        height: rows, px.
+        width: columns, px.
+        steps: frames after t.
+    """
+    clip = Street.generate(seed).clip(CURRENT + 1 + steps, height, width, start=START, samples=SAMPLES)
+    perception = Perception(clip)
+    prev, cur = (prepare_frame(perception, index) for index in (CURRENT - 1, CURRENT))
+    frames = [torch.from_numpy(clip[CURRENT + step].read_image()) for step in range(1, steps + 1)]
+    return Scene(seed, network_input(prev, cur, last_motions(prev, cur)), torch.stack(frames))
+
+
+def double(given: NetworkInput) -> NetworkInput:
+    """The same numbers in float64."""
+    prior = given.prior
+    ahead, last, before = (
+        RigidMotion(*(part.double() for part in motion))
+        for motion in (prior.next_from_cur, prior.cur_from_prev, prior.prev_from_before)
+    )
+    prior = MotionPrior(ahead, last, before, prior.velocity_prev.double(), prior.velocity_cur.double())
+    prev, cur = (LayerBatch(*(plane.double() for plane in frame)) for frame in (given.frame_prev, given.frame_cur))
+    return NetworkInput(prev, cur, given.K.double(), prior)
+
+
+def shrunk(given: NetworkInput, scale: float) -> NetworkInput:
+    """The same scene at ``scale`` of its height and width: colours are means, everything else is that of a pixel."""
+    height, width = given.frame_cur.image.shape[2:]
+    size = fraction(height, width, scale)
+    if size == (height, width):
+        return given
+
+    def picked(plane: torch.Tensor) -> torch.Tensor:
+        return functional.interpolate(plane, size, mode="nearest")
+
+    def frame(layers: LayerBatch) -> LayerBatch:
+        coloured = {name: reduced(getattr(layers, name), *size) for name in ("image", "background_image")}
+        return layers._replace(
+            **coloured, **{n: picked(getattr(layers, n)) for n in layers._fields if n not in coloured}
+        )
+
+    K = geometry.scale_intrinsics(given.K, size[1] / width, size[0] / height)
+    prior = given.prior._replace(
+        velocity_prev=picked(given.prior.velocity_prev), velocity_cur=picked(given.prior.velocity_cur)
+    )
+    return NetworkInput(frame(given.frame_prev), frame(given.frame_cur), K, prior)
+
+
+def full(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """A forecast image [B, 3, h, w] at the scene's own ``size``, values in [0, 1]."""
+    return enlarged(image, *size).clamp(0, 1)

@@ -1,0 +1,208 @@
+"""The networks and the stages of a forecast, from left to right as in the paper's figure."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+
+from vestcl import geometry
+from vestcl.models._clouds import Cloud, as_image, join, lift, lift_hidden
+from vestcl.models._encode import Memory, encode, version
+from vestcl.models._frames import EncodedFrame, grid_depth, grid_mean, with_depth
+from vestcl.models._layers import side_by_side
+from vestcl.models._motion import INTERVALS, Motion
+from vestcl.models._objects import move_objects, unmoved
+from vestcl.models._render import Camera, RenderedView, Side, compose_view, refined_channels, splat_cloud
+from vestcl.models.config import OPAQUE, ModelConfig
+from vestcl.models.effort import Effort, enlarged, fraction, reduced
+from vestcl.models.ego_motion import CameraMotion, EgoMotion, RigidMotion
+from vestcl.models.encoder import Encoder
+from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
+from vestcl.models.prior import MotionPrior, beside
+from vestcl.models.refine import Refine
+from vestcl.models.skipping import Skip, Tally
+from vestcl.ops.rigid_flow import rigid_flow
+from vestcl.ops.unproject import unproject
+from vestcl.scene.layers import LayerBatch
+
+
+class Stages(nn.Module):
+    """Encode, move, lift, show: what `Forecaster` puts together.
+
+    Args:
+        config: sizes and choices.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config, features = config, config.encoder.features
+        self.encoder = Encoder(config.encoder)
+        self.ego_motion = None if config.ego_motion is None else EgoMotion(config.ego_motion, features, config.start)
+        self.object_motion = None if config.object_motion is None else ObjectMotion(config.object_motion, features)
+        self.refine = Refine(config.refine, config.render, features)
+        #: Encoder and refinement compute in this type (torch.bfloat16, or None for the parameters' own): motion, which
+        #: is millimetres in hundreds of metres, never does.
+        self.autocast: torch.dtype | None = None
+        #: What is not computed where a scene does not need it, and how much that has been so far.
+        self.skip, self.tally = Skip(), Tally()
+        #: What is computed more coarsely than the network was trained to.
+        self.effort = Effort()
+        #: The frames that were encoded last.
+        self.memory = Memory()
+
+    def encode(self, frame: LayerBatch) -> EncodedFrame:
+        """Features of a frame and of its background, in one pass; backgrounds without foreground in front are the
+        frame itself.
+
+        Args:
+            frame: layers of B frames.
+
+        Returns:
+            Features [B, C, H, W], and depths replaced where the configuration fixes them.
+        """
+        layers = with_depth(frame, self.config.fixed_depth)
+        key = None if torch.is_grad_enabled() else self._encoding()
+        known = None if key is None else self.memory.find(key, frame)
+        if key is not None:
+            self.tally.add("seen", len(frame.image) * (known is not None), len(frame.image), "frames")
+        if known is not None:
+            return known
+        with self._autocast():
+            encoded = encode(self.encoder, self.config.encoder, layers, self.skip, self.tally)
+        if key is not None:
+            self.memory.keep(key, frame, encoded)
+        return encoded
+
+    def move(self, prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, prior: MotionPrior | None = None) -> Motion:
+        """The camera's motion from both frames to the next, the rigid flow that it makes, and the objects' flow.
+
+        Args:
+            prev: frame at t - 1.
+            cur: frame at t.
+            K: [B, 3, 3] px.
+            prior: what both start from.
+
+        Returns:
+            `Motion`; differentiable.
+        """
+        to_next = self.move_camera(prev, cur, prior)
+        flows = [
+            rigid_flow(unproject(frame.layers.depth, K), *rigid)
+            for frame, rigid in zip((prev, cur), to_next[:2], strict=True)
+        ]
+        flow0 = as_image(torch.cat(flows, dim=2), *cur.features.shape[2:])
+        start = flow0 if prior is None or self.object_motion is None else flow0 + beside(prior, to_next[:2])
+        return Motion(*to_next, flow0, start, self.move_objects(prev, cur, to_next, flow0, start))
+
+    def move_camera(self, prev: EncodedFrame, cur: EncodedFrame, prior: MotionPrior | None = None) -> CameraMotion:
+        """EMF on the encoder's grid: the camera's motion; rest where the model has no EMF."""
+        if self.ego_motion is None:
+            return CameraMotion(*2 * (RigidMotion.rest(cur.features),))
+        frames = prev, cur
+        return self.ego_motion(
+            *(frame.background_grid for frame in frames),
+            *(grid_depth(frame.layers.background_depth) for frame in frames),
+            *(grid_mean(frame.layers.mask) for frame in frames),
+            prior=None if prior is None else (prior.next_from_cur, prior.cur_from_prev, prior.prev_from_before),
+        )
+
+    def move_objects(
+        self,
+        prev: EncodedFrame,
+        cur: EncodedFrame,
+        to_next: CameraMotion,
+        flow0: torch.Tensor,
+        start: torch.Tensor,
+    ) -> ObjectMotionForecast:
+        """OMF at full size, [B, 6, H, W] m in and out; ``start`` is what it corrects."""
+        if self.object_motion is None or self.object_motion.changes_nothing:
+            return unmoved(start)
+        return move_objects(
+            self.object_motion, prev, cur, to_next, flow0, start, self.skip, self.tally, self.effort.blocks
+        )
+
+    def lift(self, prev: EncodedFrame, cur: EncodedFrame, motion: Motion, K: torch.Tensor) -> list[Cloud]:
+        """Both frames' layers as clouds on their way to t + 1; with `RenderConfig.joint` as one.
+
+        Args:
+            prev: frame at t - 1.
+            cur: frame at t.
+            motion: of both.
+            K: [B, 3, 3] px.
+
+        Returns:
+            Both frames' points, packed: N = H W + |M = 0| an image and frame, or as `RenderConfig.inpainted` says.
+        """
+        rigid, render = (motion.next_from_prev, motion.next_from_cur), self.config.render
+        flows, flows0 = motion.objects.flow.split(3, dim=1), motion.flow0.split(3, dim=1)
+        of_prev, of_cur = (lift(*arguments, K) for arguments in zip((prev, cur), flows, flows0, INTERVALS, strict=True))
+        behind_cur = lift_hidden(cur, rigid[1], K)
+        if render.inpainted == "last":
+            clouds = [join(of_prev, behind_cur), of_cur]
+        else:
+            clouds = [join(of_prev, lift_hidden(prev, rigid[0], K)), join(of_cur, behind_cur)]
+        return [join(*clouds)] if render.joint else clouds
+
+    def show(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> RenderedView:
+        """Splat each cloud into a camera, and paint the image.
+
+        Args:
+            clouds: from `lift`.
+            camera: where the view is taken from.
+            motion: that the clouds came by.
+            K: [B, 3, 3] px, of the source camera.
+
+        Returns:
+            The view, of the frames' size; differentiable.
+        """
+        sides = self.splat(clouds, camera, motion, K)
+        return compose_view(sides, self.paint(sides))
+
+    def splat(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> list[Side]:
+        """What each cloud leaves on the view, of the frames' size; arguments as in `show`."""
+        height, width = motion.flow0.shape[2:]
+        size = fraction(height, width, self.effort.splat_scale)
+        if size != (height, width):
+            camera = camera._replace(K=geometry.scale_intrinsics(camera.K, size[1] / width, size[0] / height))
+        sides = self._splat(clouds, camera, motion, K, size)
+        return [Side(*(enlarged(plane, height, width) for plane in side)) for side in sides]
+
+    def paint(self, sides: Sequence[Side]) -> torch.Tensor:
+        """The refined image [B, 3, H, W], from the channels that `RenderConfig.channels` counts."""
+        render = self.config.render
+        planes = [refined_channels(side, render.colour, render.normalised) for side in sides]
+        with self._autocast():
+            return self._refined(side_by_side(planes)).to(planes[0].dtype)
+
+    def _refined(self, rendered: torch.Tensor) -> torch.Tensor:
+        """The image; its difference to what refinement adds to is computed at `Effort.paint_scale`."""
+        height, width = rendered.shape[2:]
+        size = fraction(height, width, self.effort.paint_scale)
+        if size == (height, width):
+            return self.refine(rendered)
+        if self.refine.base == "none":
+            raise ValueError(f"`effort.paint_scale` must be 1 for {self.config.name}, which paints anew, got {size}")
+        small = reduced(rendered, *size)
+        added = self.refine(small) - self.refine.base_image(small)
+        image = self.refine.base_image(rendered) + enlarged(added, height, width)
+        return image if self.training else image.clamp(0, 1)
+
+    def _splat(
+        self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor, size: tuple[int, int]
+    ) -> list[Side]:
+        known = camera, K, motion.rigid.detach(), self.config.render, *size, self.effort.min_transmittance
+        if self.config.render.previous == "all" or len(clouds) == 1:
+            return [splat_cloud(cloud, *known) for cloud in clouds]
+        prev, cur = clouds
+        front = splat_cloud(cur, *known)
+        uncovered = front.coverage.detach() < OPAQUE
+        behind = splat_cloud(prev, *known, uncovered, self.tally if self.skip.covered else None)
+        return [Side(*(plane * uncovered for plane in behind)), front]
+
+    def _encoding(self) -> object:
+        """What features depend on beside the frame; None where they are not remembered."""
+        known = version(self.encoder) if self.skip.seen else None
+        return known and (known, self.skip, self.autocast)
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast("cpu", self.autocast, enabled=self.autocast is not None)

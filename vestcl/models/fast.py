@@ -1,0 +1,257 @@
+"""Trained networks, faster on a CPU, for inference: the same forecasts for less time and memory traffic.
+
+oneDNN's convolutions do most of what the cores can, so compiling the networks or reordering their weights gains little
+(`vestcl.bench._network_speed` measures both). What gains: the blocks of object motion share one convolution over the
+frames, which all of them look at; what losses alone need is dropped; encoder and refinement may compute in bfloat16;
+and a process that keeps the memory that it frees is spared its page faults.
+"""
+
+import ctypes
+import inspect
+import platform
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final, Literal, NamedTuple, get_args
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from vestcl.models.forecaster import Forecaster
+from vestcl.models.object_motion import (
+    MOTION_CHANNELS,
+    MotionBlock,
+    MotionConv,
+    ObjectMotion,
+    ObjectMotionForecast,
+)
+
+__all__ = ["FastForecaster", "Precision", "accelerate", "computes_bfloat16", "keep_freed_memory", "share_frames"]
+
+Precision = Literal["float32", "bfloat16"]
+
+#: Processors' names for their bfloat16 instructions, as `torch.cpu.get_capabilities` has them. Without any of these
+#: oneDNN computes in float32, and bfloat16 costs conversions on top.
+_BFLOAT16: Final = ("avx512_bf16", "amx_bf16", "avx_ne_convert", "bf16")
+
+#: Of glibc's mallopt: no memory maps of their own for large blocks, and nothing given back below 2 GiB.
+_MALLOPT: Final = ((-4, 0), (-1, 2**31 - 1))
+
+
+def accelerate(model: Forecaster, precision: Precision = "float32") -> "FastForecaster":
+    """A copy of ``model`` that forecasts the same, faster, and records no gradients; ``model`` stays as it is.
+
+    Args:
+        model: a trained one; its configuration, weights, skips and effort are copied.
+        precision: "float32" gives the same images up to rounding: within 1e-4 of values from 0 to 1, but for pixels
+            where that decides which of two points is the nearer one. "bfloat16" lets encoder and refinement compute in
+            it: PSNR against the others is 40 dB and more. It pays on processors that have it, see `computes_bfloat16`.
+
+    Returns:
+        The copy. Its forecasts have no `ObjectMotionForecast.candidates`.
+
+    Raises:
+        ValueError: another precision, or a model that is accelerated already.
+    """
+    if precision not in get_args(Precision):
+        raise ValueError(f"`precision` must be one of {', '.join(get_args(Precision))}, got {precision!r}")
+    if isinstance(model, FastForecaster):
+        raise ValueError(f"`model` must be a plain Forecaster, got {model.config.name} accelerated already")
+    return FastForecaster(model, precision)
+
+
+def computes_bfloat16() -> bool:
+    """Whether this processor has instructions for bfloat16; False where torch does not tell."""
+    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    return any(capabilities.get(name, False) for name in _BFLOAT16)
+
+
+def keep_freed_memory() -> bool:
+    """Let this process keep what it frees, from now on: a forecast's large tensors come and go by the dozen.
+
+    glibc returns blocks of that size to the system, which then has to find, clear and map the pages of the next one.
+    The price is that the process stays as large as it has ever been.
+
+    Returns:
+        Whether it does: with other C libraries than glibc nothing is changed.
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return False
+    mallopt: Callable[[int, int], int] = ctypes.CDLL(None).mallopt
+    done = [mallopt(parameter, value) for parameter, value in _MALLOPT]
+    return all(done)
+
+
+class FastForecaster(Forecaster):
+    """A `Forecaster` for inference; `accelerate` makes it.
+
+    Args:
+        model: whose configuration, weights, skips and effort it copies.
+        precision: that encoder and refinement compute in.
+    """
+
+    def __init__(self, model: Forecaster, precision: Precision) -> None:
+        super().__init__(model.config)
+        self.load_state_dict(model.state_dict())
+        self.skip, self.effort = model.skip, model.effort
+        self.autocast = torch.bfloat16 if precision == "bfloat16" else None
+        if self.object_motion is not None:
+            self.object_motion.register_forward_hook(_without_candidates)
+            share_frames(self.object_motion)
+        self.eval()
+        for parameter in self.parameters():
+            parameter.requires_grad_(False)
+
+    def train(self, mode: bool = True) -> "FastForecaster":
+        """Stay in evaluation mode.
+
+        Raises:
+            ValueError: training mode is asked for.
+        """
+        if mode:
+            raise ValueError("`mode` must be False: an accelerated forecaster can't be trained, got True")
+        super().train(False)
+        return self
+
+    def requires_grad_(self, requires_grad: bool = True) -> "FastForecaster":
+        """Stay without gradients.
+
+        Raises:
+            ValueError: they are asked for.
+        """
+        if requires_grad:
+            raise ValueError("`requires_grad` must be False: an accelerated forecaster has no gradients, got True")
+        return self
+
+    def forecast(self, *arguments: Any, **named: Any) -> Any:
+        """As `Forecaster.forecast`, without gradients.
+
+        Raises:
+            ValueError: as there; a tensor that gradients are recorded for.
+        """
+        return _without_gradient(super().forecast, *arguments, **named)
+
+    def present(self, *arguments: Any, **named: Any) -> Any:
+        """As `Forecaster.present`, without gradients.
+
+        Raises:
+            ValueError: as there; a tensor that gradients are recorded for.
+        """
+        return _without_gradient(super().present, *arguments, **named)
+
+
+def _without_gradient(task: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    if torch.is_grad_enabled():
+        for name, value in inspect.signature(task).bind(*arguments, **named).arguments.items():
+            if any(tensor.requires_grad for tensor in _tensors(value)):
+                wanted = f"`{name}` must not require a gradient, which an accelerated forecaster does not record"
+                raise ValueError(f"{wanted}; got one that does: use the plain model, or torch.no_grad()")
+    with torch.no_grad():
+        return task(*arguments, **named)
+
+
+def _tensors(value: Any) -> Iterator[torch.Tensor]:
+    """Those in tuples and lists, however deep."""
+    if isinstance(value, torch.Tensor):
+        yield value
+    elif isinstance(value, tuple | list):
+        for part in value:
+            yield from _tensors(part)
+
+
+def _without_candidates(_: nn.Module, __: Any, forecast: ObjectMotionForecast) -> ObjectMotionForecast:
+    return forecast._replace(candidates=[])
+
+
+# ---------------------------------------------------------------- object motion
+
+
+def share_frames(network: ObjectMotion) -> bool:
+    """Let the blocks of ``network`` share one convolution over the frames, for inference; its outputs stay the same.
+
+    A block begins with conv(frames) + conv(U), at full size and at its own scale, and the frames are the same for all
+    blocks. Few channels out of many are what convolutions are worst at, and each reads all of the frames.
+
+    Args:
+        network: object motion of shape "dmvfn" without routing; its weights may be changed by `load_state_dict` alone
+            from now on.
+
+    Returns:
+        Whether they do. Others stay as they are: blocks that routing leaves out would be computed after all, and at the
+        paper's strides the joint channels would not fit into caches.
+    """
+    if network.config.shape != "dmvfn" or network.routing is not None:
+        return False
+    entering: dict[int, list[tuple[MotionBlock, str]]] = {}
+    for block in network.blocks:
+        assert isinstance(block, MotionBlock)
+        entering.setdefault(1, []).append((block, "full_in"))
+        entering.setdefault(block.scale, []).append((block, "shrunk_in"))
+    for places in entering.values():
+        joint = JointConv([getattr(block, name) for block, name in places])
+        start = 0
+        for block, name in places:
+            setattr(block, name, SharedMotionConv(getattr(block, name), joint, start))
+            start += getattr(block, name).out_channels
+    return True
+
+
+class _Looked(NamedTuple):
+    frames: weakref.ref[torch.Tensor]
+    result: torch.Tensor
+
+
+class JointConv:
+    """The part over the frames of several `MotionConv`, as one convolution that runs once for the same frames.
+
+    Args:
+        convs: of one stride.
+    """
+
+    def __init__(self, convs: Sequence[MotionConv]) -> None:
+        self._convs = tuple(convs)
+        self._weights: tuple[torch.Tensor, torch.Tensor] | None = None
+        self._looked: _Looked | None = None
+
+    def forget(self) -> None:
+        """The convolutions' weights have changed."""
+        self._weights = self._looked = None
+
+    def __call__(self, frames: torch.Tensor) -> torch.Tensor:
+        """[B, frames, H, W] -> [B, channels of all, ceil(H / stride), ceil(W / stride)]."""
+        looked = self._looked
+        if looked is None or looked.frames() is not frames:
+            conv, (weight, bias) = self._convs[0], self._weights or self._joined()
+            result = functional.conv2d(frames, weight, bias, conv.stride, conv.padding)
+            looked = self._looked = _Looked(weakref.ref(frames), result)
+        return looked.result
+
+    def _joined(self) -> tuple[torch.Tensor, torch.Tensor]:
+        weights = torch.cat([conv.weight.detach()[:, :-MOTION_CHANNELS] for conv in self._convs])
+        biases = torch.cat([conv.bias.detach() for conv in self._convs if conv.bias is not None])
+        self._weights = weights, biases
+        return self._weights
+
+
+class SharedMotionConv(MotionConv):
+    """`MotionConv` whose part over the frames is ``joint``'s.
+
+    Args:
+        conv: whose weights it has.
+        joint: that ``conv`` is a part of.
+        start: its first channel there.
+    """
+
+    def __init__(self, conv: MotionConv, joint: JointConv, start: int) -> None:
+        super().__init__(conv.in_channels - MOTION_CHANNELS, conv.out_channels, conv.stride[0])
+        self.weight, self.bias = conv.weight, conv.bias
+        self._joint, self._channels = joint, slice(start, start + conv.out_channels)
+
+    def forward(self, frames: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        """As `MotionConv.forward`."""
+        of_flow = functional.conv2d(flow, self.weight[:, -MOTION_CHANNELS:], None, self.stride, self.padding)
+        return of_flow + self._joint(frames)[:, self._channels]
+
+    def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
+        super()._load_from_state_dict(*arguments, **named)
+        self._joint.forget()
