@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from forecaster_scenes import OBJECTS, SMALL, camera, frame, measured, pair_of, stir
+from forecaster_scenes import OBJECTS, SMALL, camera, frame, measured, pair_of, stir, wall
 from torch import nn
 from torch.nn import functional
 
 from vestcl.models import configuration
 from vestcl.models._encode import encode
-from vestcl.models.config import EncoderConfig
+from vestcl.models.config import EncoderConfig, RenderConfig
 from vestcl.models.encoder import STRIDE, Encoder, reach
 from vestcl.models.forecaster import Forecaster, Step
 from vestcl.models.object_motion import ObjectMotion
@@ -226,3 +226,34 @@ def test_a_copy_remembers_nothing_of_other_weights(tmp_path: Path) -> None:
     again, _ = forecast(network, pair, Skip())
     assert torch.equal(loaded.views[0].image, again.views[0].image)
     assert not torch.equal(before.views[0].image, again.views[0].image)
+
+
+def test_the_inpainted_shows_in_inner_holes_alone() -> None:
+    """A block in the middle and one at the border leave holes; the splatted background is behind the first alone."""
+    torch.manual_seed(2)
+    network, K = Forecaster(SPARE).eval(), camera(1, HEIGHT, WIDTH)
+    rear = wall(HEIGHT, WIDTH, 20.0)
+    depth, mask = rear.depth.clone(), rear.mask.clone()
+    for columns in (slice(200, 240), slice(440, 480)):
+        depth[..., 20:40, columns], mask[..., 20:40, columns] = 5.0, 0.0
+    cur = rear._replace(depth=depth, mask=mask, image=torch.where(mask > 0, rear.image, 0.5))
+    gone = measured(1, HEIGHT, WIDTH, velocity=(0, 0, 0))
+    aside = gone.velocity_cur.clone()
+    aside[:, 1] = torch.where(mask[:, 0] > 0, 0.0, 60.0)  # both leave the picture, as all of the frame before
+    gone = gone._replace(velocity_prev=torch.full_like(aside, 60.0) * torch.tensor([0.0, 1, 0])[:, None, None])
+    gone = gone._replace(velocity_cur=aside)
+    seen = {}
+    for rule in ("last", "inner"):
+        render = dataclasses.replace(SPARE.render, inpainted=rule)
+        network.config = dataclasses.replace(network.config, render=render)
+        with torch.no_grad():
+            steps = network.forecast(rear, cur, K, prior=gone)
+        seen[rule] = steps[0].views[0].coverage[0, 0]
+    inside, border = (slice(24, 36), slice(206, 234)), (slice(24, 36), slice(446, 460))
+    assert seen["last"][inside].min() > 0.5 and seen["last"][border].min() > 0.5
+    assert seen["inner"][inside].min() > 0.5 and seen["inner"][border].max() < 0.5
+
+
+def test_inner_holes_need_to_know_what_is_open() -> None:
+    with pytest.raises(ValueError, match='`inpainted` may be "inner" with `previous` "uncovered" alone'):
+        RenderConfig(inpainted="inner")

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
+import numpy as np
 import torch
 from torch.nn import functional
 
@@ -14,6 +15,7 @@ from vestcl.models.config import LEAST_COVERAGE, RenderConfig
 from vestcl.models.skipping import Tally
 from vestcl.ops.displace import displace
 from vestcl.ops.splat import composite, rasterize
+from vestcl.scene.holes import deep_holes
 from vestcl.scene.layers import SKY_DEPTH
 
 #: Pixels that were next to each other belong to one surface if the view shows them no farther apart than that, times
@@ -96,6 +98,7 @@ def splat_cloud(
     min_transmittance: float = 0.0,
     open_: torch.Tensor | None = None,
     tally: Tally | None = None,
+    deep: torch.Tensor | None = None,
 ) -> Side:
     """Show a cloud in ``camera``: opaque points of radius r = rho z_src / z_tgt f_tgt / f_src, clamped to RADIUS.
 
@@ -113,6 +116,7 @@ def splat_cloud(
         min_transmittance: see `vestcl.splat`.
         open_: bool [B, 1, H, W], the pixels that count: others may be left empty. None is all.
         tally: is told how many points that left out; None leaves out none.
+        deep: bool [B, 1, H, W], the pixels where inpainted points count, from `inner_holes`; None is all.
 
     Returns:
         What is seen; differentiable in the cloud, through positions, radii and inverse depth.
@@ -127,9 +131,11 @@ def splat_cloud(
         magnified = magnified * stretch
     radii = (config.rho * magnified).clamp(*RADIUS)
     order = z.detach()
-    if config.inpainted == "last":
+    if config.inpainted != "own":
         order = order + _BEHIND * cloud.inpainted
     starts = cloud.starts
+    if deep is not None:
+        opacities = opacities * (~cloud.inpainted | _found(points_uv.detach(), starts, deep))
     if open_ is not None and tally is not None:
         kept = _reaching(points_uv.detach(), radii.detach(), cloud.starts, open_)
         tally.add("covered", len(z) - len(kept), len(z), "points")
@@ -148,6 +154,24 @@ def splat_cloud(
         image = torch.cat([image, more], dim=1)
     features, colour, inverse_depth, background, inverse_motion = image.split([image.shape[1] - 8, 3, 1, 1, 3], dim=1)
     return Side(features, colour, coverage, inverse_depth, background, inverse_motion)
+
+
+def inner_holes(hole: torch.Tensor) -> torch.Tensor:
+    """Where foreground moved away from the background: holes [B, 1, H, W] but for cracks and what reaches the border.
+
+    What enters the picture was never hidden by anything: what is beside it is a better guess than what was inpainted.
+    """
+    return torch.from_numpy(np.stack([deep_holes(image) for image in hole.numpy()]))
+
+
+def _found(points_uv: torch.Tensor, starts: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
+    """bool [P]: which points [P, 2] px come to pixels of ``where`` [B, 1, H, W]; none from outside."""
+    height, width = where.shape[2:]
+    column, row = points_uv.nan_to_num(-1).floor().long().unbind(1)
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    image = torch.arange(len(where)).repeat_interleave(starts.diff())
+    place = (image * height + row.clamp(0, height - 1)) * width + column.clamp(0, width - 1)
+    return inside & where.flatten()[place]
 
 
 def _reaching(points_uv: torch.Tensor, radii: torch.Tensor, starts: torch.Tensor, open_: torch.Tensor) -> torch.Tensor:

@@ -12,7 +12,7 @@ from vestcl.models._frames import EncodedFrame, grid_depth, grid_mean, with_dept
 from vestcl.models._layers import side_by_side
 from vestcl.models._motion import INTERVALS, Motion
 from vestcl.models._objects import move_objects, unmoved
-from vestcl.models._render import Camera, RenderedView, Side, compose_view, refined_channels, splat_cloud
+from vestcl.models._render import Camera, RenderedView, Side, compose_view, inner_holes, refined_channels, splat_cloud
 from vestcl.models.config import OPAQUE, ModelConfig
 from vestcl.models.effort import Effort, enlarged, fraction, reduced
 from vestcl.models.ego_motion import CameraMotion, EgoMotion, RigidMotion
@@ -137,7 +137,7 @@ class Stages(nn.Module):
         flows, flows0 = motion.objects.flow.split(3, dim=1), motion.flow0.split(3, dim=1)
         of_prev, of_cur = (lift(*arguments, K) for arguments in zip((prev, cur), flows, flows0, INTERVALS, strict=True))
         behind_cur = lift_hidden(cur, rigid[1], K)
-        if render.inpainted == "last":
+        if render.inpainted != "own":
             clouds = [join(of_prev, behind_cur), of_cur]
         else:
             clouds = [join(of_prev, lift_hidden(prev, rigid[0], K)), join(of_cur, behind_cur)]
@@ -196,7 +196,8 @@ class Stages(nn.Module):
         prev, cur = clouds
         front = splat_cloud(cur, *known)
         uncovered = front.coverage.detach() < OPAQUE
-        behind = splat_cloud(prev, *known, uncovered, self.tally if self.skip.covered else None)
+        deep = inner_holes(uncovered) if self.config.render.inpainted == "inner" else None
+        behind = splat_cloud(prev, *known, uncovered, self.tally if self.skip.covered else None, deep)
         return [Side(*(plane * uncovered for plane in behind)), front]
 
     def _encoding(self) -> object:

@@ -141,13 +141,18 @@ class RenderConfig:
     """Radius in source pixels."""
     stretched: bool = False
     """Radii grow with the distance between a surface's points, and points without a surface are left out."""
-    inpainted: Literal["own", "last"] = "own"
+    inpainted: Literal["own", "last", "inner"] = "own"
     """"own": the background behind a frame's foreground is part of that frame's cloud, at its own depth. "last": only
-    the current frame's is shown, as part of the previous frame's cloud, and behind all that this one has seen."""
+    the current frame's is shown, as part of the previous frame's cloud, and behind all that this one has seen. "inner":
+    and where the current frame leaves a hole inside the picture that is no crack; needs ``previous`` "uncovered"."""
     previous: Literal["all", "uncovered"] = "all"
     """"uncovered": the previous frame's cloud shows only where the current one's covers less than OPAQUE."""
     normalised: bool = False
     """Features, colour and inverse depth go into refinement divided by coverage; False leaves them times coverage."""
+
+    def __post_init__(self) -> None:
+        if self.inpainted == "inner" and (self.previous != "uncovered" or self.joint):
+            raise ValueError('`inpainted` may be "inner" with `previous` "uncovered" alone, and not with `joint`')
 
     def side_channels(self, features: int) -> int:
         """Channels of one rendered image: features, and then colour 3, coverage 1, inverse depth 1 (1/m)."""
