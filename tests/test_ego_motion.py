@@ -110,13 +110,27 @@ def test_how_the_camera_swayed_counts_in_a_line() -> None:
     with torch.no_grad():
         network.swayed.weight.copy_(weight.flatten(0, 1).flatten(1))
     still, none = torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1), torch.zeros(2, 3)
-    turning = RigidMotion(-3 * (still + sizes * torch.tensor([[0.0, 0, 0.001, 0]])), none)
+    ahead = torch.tensor([[0.0, 0, 1]]).repeat(2, 1)
+    turning = RigidMotion(-3 * (still + sizes * torch.tensor([[0.0, 0, 0.001, 0]])), ahead)
     sliding = RigidMotion(still, sizes * torch.tensor([[0.25, 0, 0]]))
     first, second, third = intervals(network(**scene(2, 16, 24), prior=(RigidMotion(still, none), turning, sliding)))
     angle = 0.002 * sizes[:, 0]  # twice the half, and of that said 100 * 0.5 * 0.03
     assert torch.allclose(first[:, 0, 2], 100 * 0.5 * 0.03 * angle, rtol=1e-3)
     assert torch.equal(second, torch.eye(4).repeat(2, 1, 1))
     assert torch.allclose(third[:, :3, 3], 0.1 * 2.0 * 0.25 * sizes * torch.tensor([[0.0, 0, 1]]))
+
+
+@pytest.mark.parametrize(("metres", "share"), [(0.0, 0.0), (0.1, 0.2), (0.5, 1.0), (2.0, 1.0)])
+def test_a_camera_that_stands_is_not_corrected(metres: float, share: float) -> None:
+    """Below half a metre an interval a correction counts by what was measured of it."""
+    network, (next_from_cur, cur_from_prev, before) = EgoMotion(PATH, 4, "prior"), random_prior(1)
+    with torch.no_grad():
+        network.motion.bias.copy_(torch.tensor([[0.0, 0, 0, 0, 0, 1]] * PATH.path).flatten())
+    rolling = RigidMotion(cur_from_prev.quaternion, torch.tensor([[0.0, 0, metres]]))
+    answer = network(**scene(1, 16, 24), prior=(next_from_cur, rolling, before))
+    for motion in (answer.next_from_cur, *answer.later):
+        assert torch.equal(motion.quaternion, next_from_cur.quaternion)
+        assert_close(motion.translation - next_from_cur.translation, torch.tensor([[0.0, 0, 0.1 * share]]))
 
 
 def test_adams_first_step_is_a_small_motion() -> None:

@@ -19,6 +19,7 @@ from forecaster_scenes import (
 )
 
 from vestcl import geometry
+from vestcl.models.ego_motion import RigidMotion
 from vestcl.models.forecaster import Forecaster
 
 #: What is said of three intervals, turn and shift: a metre to the side, one more metre, and one back again.
@@ -47,8 +48,10 @@ def test_a_path_by_hand() -> None:
 def test_composed_frames_go_along_the_path() -> None:
     """On a wall 10 m away a metre is 3 px: shifts by 3, 9, 6 and, the last motion once more, 3."""
     model, scene = correct(Forecaster(SHARP_PATH), *SIDEWAYS).eval(), wall(32, 64, 10.0)
+    rolling = RigidMotion(torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[0.0, 1, 0]]))  # or nothing is corrected
+    prior = measured(1, 32, 64)._replace(cur_from_prev=rolling)
     with torch.no_grad():
-        steps = model.forecast(scene, scene, camera(1, 32, 64), 4, None, "compose", prior=measured(1, 32, 64))
+        steps = model.forecast(scene, scene, camera(1, 32, 64), 4, None, "compose", prior=prior)
     for step, shift, moved in zip(steps, (3, 9, 6, 3), (1.0, 2.0, -1.0, -1.0), strict=True):
         view = step.views[0]
         inside = slice(shift + 12, -6)

@@ -56,7 +56,7 @@ def test_vest_s_can_skip() -> None:
     config = configuration("vest-s")
     assert config.object_motion is not None
     assert (config.encoder.background, config.object_motion.where) == ("frame", "foreground")
-    assert (config.render.inpainted, config.render.previous) == ("last", "uncovered")
+    assert (config.render.inpainted, config.render.previous) == ("inner", "uncovered")
 
 
 @pytest.mark.parametrize("switch", ["background", "objects", "covered", "views"])

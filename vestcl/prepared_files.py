@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from vestcl.prepared import Prepared
 
 #: Raised when perception, the procedural street or these files change: it makes every frame be computed anew.
-RECIPE: Final = "vestcl prepared 1"
+RECIPE: Final = "vestcl prepared 2"
 
 JSON: Final = "clip.json"
 

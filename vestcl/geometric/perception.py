@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
 from vestcl.geometric import objects
+from vestcl.geometric.photometric import Pair, confirmed, search
 from vestcl.io.labels import SKY, background
 from vestcl.scene.correspondence import Correspondence, correspond
 from vestcl.scene.ego_motion import ego_motion
@@ -174,7 +175,9 @@ class Perception:
                 before = np.zeros_like(before)
             measured = self.raw_depth(index), before, self.inverse_std(index)
             motion = self.correspondence(index), self.prev_from_cur(index), sample.K
-            by_thing = objects.velocities(things, *measured, *motion)
+            pair = Pair(layers.image, self.image(index - 1), self.prev_from_cur(index), sample.K)
+            by_thing = search(things, objects.velocities(things, *measured, *motion), self.raw_depth(index), pair)
             velocity = by_thing.astype(np.float32)[things].transpose(2, 0, 1)
-            velocity = objects.follow_flow(velocity, layers.image, layers.depth, *motion)
+            by_flow = objects.follow_flow(velocity, layers.image, layers.depth, *motion)
+            velocity = confirmed(by_flow, velocity, layers.depth, pair)
         return Seen(layers, things, velocity, own)

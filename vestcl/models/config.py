@@ -220,7 +220,7 @@ VEST_S: Final = ModelConfig(
     object_motion=ObjectMotionConfig(
         "dmvfn", scales=(4, 4, 2, 2, 1, 1), widths=(64, 64, 32, 32, 16, 16), detail=8, where="foreground"
     ),
-    render=RenderConfig(rho=RHO_DIRECT, stretched=True, inpainted="last", previous="uncovered", normalised=True),
+    render=RenderConfig(rho=RHO_DIRECT, stretched=True, inpainted="inner", previous="uncovered", normalised=True),
     refine=RefineConfig(stem=16, stem_kernel=3, widths=(32, 64, 96, 128), base="filled"),
     start="prior",
 )
@@ -247,6 +247,12 @@ def _from_rest(config: ModelConfig) -> ModelConfig:
     return dataclasses.replace(config, ego_motion=camera, start="rest")
 
 
+def _jointly(config: ModelConfig) -> ModelConfig:
+    """One pass, which can't show inpainted points in the holes that another one leaves."""
+    inpainted = "last" if config.render.inpainted == "inner" else config.render.inpainted
+    return dataclasses.replace(config, render=dataclasses.replace(config.render, joint=True, inpainted=inpainted))
+
+
 def _without_colour(config: ModelConfig) -> ModelConfig:
     return dataclasses.replace(config, render=dataclasses.replace(config.render, colour=False))
 
@@ -263,7 +269,7 @@ VARIANTS: Final[Mapping[str, Callable[[ModelConfig], ModelConfig]]] = MappingPro
         "no-emf": _without_ego_motion,
         "no-omf": lambda c: dataclasses.replace(c, object_motion=None),
         "features-only": lambda c: _without_colour(_change_base(c, "none")),
-        "joint": lambda c: dataclasses.replace(c, render=dataclasses.replace(c.render, joint=True)),
+        "joint": _jointly,
         "residual": lambda c: _change_base(c, "splatted"),
         "filled": lambda c: _change_base(c, "filled"),
         "painting": lambda c: _change_base(c, "none"),

@@ -26,6 +26,10 @@ _TURN_SHOWN: Final = 100.0
 #: so that Adam's first steps, all of one size, are small ones of motion.
 _TURN_SAID, _SHIFT_SAID = 0.03, 0.1
 
+#: Metres an interval from which on a correction counts in full: a car that stands does not turn or sway, and half of
+#: what little is measured of it is noise.
+_ROLLING: Final = 0.5
+
 #: No motion: the quaternion (1, 0, 0, 0) and the translation 0.
 _REST: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -78,8 +82,9 @@ class EgoMotion(nn.Module):
 
     With ``start`` "prior" it corrects a motion that was measured and extrapolated: G_k = D_k G with k = 1 ... path, for
     the intervals after t. D_k is the sum of a linear layer of the mean token, and one of the last two motions' numbers:
-    how a car sways on is nearly linear in how it did. Both are 0 at the start. The motions' numbers are added to every
-    token, too. next_from_prev is G_1 after the measured motion from t - 1 to t.
+    how a car sways on is nearly linear in how it did. Both are 0 at the start, and count by min(|t| / _ROLLING, 1), t
+    the translation that was measured from t - 1 to t. The motions' numbers are added to every token, too.
+    next_from_prev is G_1 after the measured motion from t - 1 to t.
 
     Source: SPEC section 4; the paper's section on ego-motion forecasting.
     """
@@ -158,7 +163,8 @@ class EgoMotion(nn.Module):
         if prior is None or self.swayed is None:
             first, second = said.chunk(2, dim=1)
             return CameraMotion(RigidMotion(first[:, :4], first[:, 4:]), RigidMotion(second[:, :4], second[:, 4:]))
-        corrections = (said + self.swayed(measured)).split(_NUMBERS, dim=1)
+        rolling = torch.linalg.vector_norm(prior[1].translation, dim=1, keepdim=True) / _ROLLING
+        corrections = ((said + self.swayed(measured)) * rolling.clamp(max=1)).split(_NUMBERS, dim=1)
         path = [_correction(six).after(prior[0]) for six in corrections]
         return CameraMotion(path[0].after(prior[1]), path[0], tuple(path[1:]))
 

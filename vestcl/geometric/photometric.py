@@ -1,0 +1,173 @@
+"""Which velocities the pictures confirm: what moves by v looks in the frame before, at x - v, as it does now.
+
+Flow is wrong where it is large, on cars that pass close by above all, and says of those that are parked that they move.
+What a picture shows of a wrong motion is something else.
+"""
+
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vestcl.scene import _check
+from vestcl.scene.completion import smooth
+from vestcl.scene.correspondence import sample
+from vestcl.scene.motion_plane import rays_of
+
+Array = NDArray[np.float64]
+
+#: Differences of colour beyond that are of something else, and count no more.
+_OTHER: Final = 0.15
+
+#: A motion is believed if it leaves so much of the difference at most ...
+_LEFT: Final = 0.9
+
+#: ... and takes that much from it at least: noise of a picture.
+_NOISE: Final = 0.002
+
+#: Metres a frame: what is slower stands. Half of a walk at 10 Hz.
+_SLOWEST: Final = 0.05
+
+#: Things are searched along the camera's axes x and z up to so many metres a frame: at 10 Hz 8 m/s across and 32 m/s
+#: against us, by steps of a pixel or as many as this to either side.
+_AXES: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_FARTHEST, _MOST = np.array([0.8, 3.2]), 60
+
+#: Then around the best in both at once: so many pixels, in turn.
+_SIZES: Final = (2.0, 2.0, 1.0, 1.0, 0.5, 0.5, 0.25, 0.12)
+_AROUND: Final = np.array([[x, z] for x in (-1.0, 0.0, 1.0) for z in (-1.0, 0.0, 1.0)])
+
+#: Pixels of a thing that take part in the search and in what decides, evenly chosen. With fewer nothing is searched.
+_SEARCHED, _COMPARED, _FEWEST = 300, 1500, 30
+
+#: Of a thing's pixels so many must have been inside the frame before.
+_INSIDE: Final = 0.5
+
+#: Differences are averaged over windows of so many pixels.
+_WINDOW: Final = 5
+
+
+class Pair(NamedTuple):
+    """Two frames of one camera."""
+
+    image: NDArray[np.float32]
+    """[3, H, W] RGB in [0, 1] at t."""
+    image_prev: NDArray[np.float32]
+    """The same at t - 1."""
+    prev_from_cur: Array
+    """[4, 4] m, the camera's motion."""
+    K: Array
+    """[3, 3] px."""
+
+    def unlikeness(self, points: Array, colours: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Mean over RGB of |colour - colour of the frame before where the point is seen there|; NaN outside of it.
+
+        Args:
+            points: [n, m, 3] m in the camera's axes at t, where they would be at t - 1 had the camera not moved.
+            colours: [3, m] or [3, n, m] at t.
+
+        Returns:
+            [n, m].
+        """
+        there = points @ self.prev_from_cur[:3, :3].T + self.prev_from_cur[:3, 3]
+        x, y, z = np.moveaxis(there @ self.K.T, -1, 0)
+        far = np.maximum(z, 0.1)
+        seen = sample(self.image_prev, x / far - 0.5, y / far - 0.5, outside=np.nan)
+        difference = np.abs(seen - (colours if colours.ndim == 3 else colours[:, None])).mean(0)
+        return np.where(z > 0.1, difference, np.float32(np.nan))
+
+
+def search(things: NDArray[np.int32], by_flow: Array, depth: NDArray[np.float32], pair: Pair) -> Array:
+    """v_n [n + 1, 3] m a frame for each thing: of 0, what flow says, and steps ahead and aside, what looks most alike.
+
+    min over v of the mean over pixels of min(|I(p) - I_prev(project(K (R (x - v) + t)))|, OTHER), first along the
+    camera's axes x and z, then around the best by ever smaller steps. Unless that is LEFT times what v = 0 gives or
+    less, the thing stands still.
+
+    Args:
+        things: [H, W], 0 = background.
+        by_flow: [n + 1, 3] m a frame, `vestcl.geometric.objects.velocities`.
+        depth: [1, H, W] m at t; 0 = invalid.
+        pair: both frames.
+
+    Returns:
+        Row 0 is 0, as are things that stand, and all that are too small to tell.
+    """
+    found, inverse = np.zeros_like(by_flow), np.linalg.inv(pair.K)
+    valid = (things > 0) & (depth[0] > 0)
+    for thing in range(1, len(found)):
+        y, x = np.nonzero(valid & (things == thing))
+        if len(x) < _FEWEST:
+            continue
+        y, x = (where[:: -(-len(where) // _COMPARED)] for where in (y, x))
+        points = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ inverse.T * depth[0, y, x, None]
+        found[thing] = _search(points, pair.image[:, y, x], by_flow[thing], pair)
+    return found
+
+
+def _search(points: Array, colours: NDArray[np.float32], by_flow: Array, pair: Pair) -> Array:
+    """One thing's v [3]."""
+    few = slice(None, None, -(-len(points) // _SEARCHED))
+    pixel = _of_a_pixel(points[few], pair.K)
+    lines = [
+        np.arange(-count, count + 1)[:, None] * step * axis
+        for axis, step, count in zip(_AXES, pixel, np.minimum(_FARTHEST / pixel, _MOST).astype(int), strict=True)
+    ]
+    tries = np.concatenate([np.zeros((1, 3)), by_flow[None], *lines])
+    best = tries[_costs(points[few], colours[:, few], tries, pair).argmin()]
+    for size in _SIZES:
+        around = best + size * (_AROUND * pixel) @ _AXES
+        best = around[_costs(points[few], colours[:, few], around, pair).argmin()]
+    still, moving = _costs(points, colours, np.stack([np.zeros(3), best]), pair)
+    moves = np.linalg.norm(best) >= _SLOWEST and moving < min(_LEFT * still, still - _NOISE)
+    return best if moves else np.zeros(3)
+
+
+def _of_a_pixel(points: Array, K: Array) -> Array:
+    """Metres aside and ahead that shift a thing's pixels by about one, or so many that MOST reach FARTHEST, [2]."""
+    x, y, z = np.median(points, axis=0)
+    spread = np.hypot(x, y) + np.abs(points[:, :2] - (x, y)).max()
+    return np.asarray(np.maximum(np.array([z, z**2 / spread]) / K[0, 0], _FARTHEST / _MOST), np.float64)
+
+
+def _costs(points: Array, colours: NDArray[np.float32], tries: Array, pair: Pair) -> NDArray[np.float32]:
+    """Mean unlikeness of each of ``tries`` [n, 3], infinite where too little is inside the frame before; but for v = 0
+    a single point will do."""
+    difference = np.minimum(pair.unlikeness(points - tries[:, None], colours), np.float32(_OTHER))
+    inside = np.isfinite(difference)
+    count = inside.sum(1)
+    mean = np.where(inside, difference, 0).sum(1) / np.maximum(count, 1)
+    enough = (count >= _INSIDE * len(points)) | ((count > 0) & ~tries.any(1))
+    return np.where(enough, mean, np.float32(np.inf))
+
+
+def confirmed(
+    corrected: NDArray[np.float32], velocity: NDArray[np.float32], depth: NDArray[np.float32], pair: Pair
+) -> NDArray[np.float32]:
+    """v + g (c - v): ``velocity`` v, corrected to c as far as the pictures then look more alike.
+
+    g = (d_v - d_c) / ((1 - LEFT) d_v + NOISE / 2), between 0 and 1, where d is the difference of both frames' colours
+    under a velocity, smoothed up to the picture's edges.
+
+    Args:
+        corrected: c [3, H, W] m a frame, from `vestcl.geometric.objects.follow_flow`.
+        velocity: v [3, H, W] m a frame.
+        depth: [1, H, W] m at t, above 0.
+        pair: both frames.
+
+    Returns:
+        [3, H, W] m a frame.
+    """
+    guide = _check.pixels(pair.image)
+    before, after = (smooth(guide, _difference(v, depth, pair)) for v in (velocity, corrected))
+    share = ((before - after) / ((1 - _LEFT) * before + _NOISE / 2)).clip(0, 1).astype(np.float32)
+    return velocity + share * (corrected - velocity)
+
+
+def _difference(velocity: NDArray[np.float32], depth: NDArray[np.float32], pair: Pair) -> NDArray[np.float32]:
+    """[H, W], averaged over windows; what was outside the frame before differs by OTHER."""
+    height, width = depth.shape[1:]
+    points = np.moveaxis(rays_of(pair.K, height, width) * depth - velocity, 0, -1)
+    known = np.minimum(np.nan_to_num(pair.unlikeness(points, pair.image), nan=_OTHER), np.float32(_OTHER))
+    return np.asarray(cv2.blur(known, (_WINDOW, _WINDOW)), np.float32)
