@@ -1,6 +1,7 @@
 """What is skipped changes nothing: each switch against everything computed, on scenes with and without foreground."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,27 @@ def test_without_foreground_nothing_moves_by_itself() -> None:
     assert ran == ["encoder", "encoder"]
     for switch in ("background", "objects"):
         assert tally.counts[switch].skipped == tally.counts[switch].of > 0
+
+
+def test_what_stands_is_taken_to_stand() -> None:
+    """Of two cars the one that was measured to move; a pixel alone does not."""
+    network, (prev, cur), K = model(), scene(), camera(1, HEIGHT, WIDTH)
+    for one in (prev, cur):
+        one.mask.fill_(1)
+        one.mask[..., 32:64, 32:80] = one.mask[..., 32:64, 208:256] = 0
+    prior = measured(1, HEIGHT, WIDTH)
+    for velocity in (prior.velocity_prev, prior.velocity_cur):
+        velocity[:, 2, 32:64, 32:80] = 0.8
+        velocity[:, 2, 40, 210] = 0.8
+    network.skip, network.tally = Skip(margin=0, still=True), Tally()
+    with torch.no_grad():
+        motion = network.forecast(prev, cur, K, 1, [], "compose", prior=prior)[0].motion
+    moved = (motion.objects.flow != motion.start).any(dim=1)[0]
+    assert moved[32:64, 32:80].float().mean() > 0.9
+    moved[32:64, 32:80] = False
+    assert not moved.any()
+    count = network.tally.counts["objects"]
+    assert count.skipped > count.of * 0.7
 
 
 def test_static_background_keeps_its_motion() -> None:
@@ -201,15 +223,29 @@ def test_gradients_are_those_of_everything_computed() -> None:
 
 
 def test_boxes_by_hand() -> None:
-    wanted = torch.zeros(40, 100, dtype=torch.bool)
+    wanted = torch.zeros(300, 601, dtype=torch.bool)
     assert boxes(wanted, 4, 8) == []
-    wanted[10, 20] = wanted[30, 90] = True
-    assert boxes(wanted, 0, 8) == [Box(8, 16, 16, 24), Box(24, 32, 88, 96)]
-    assert boxes(wanted, 10, 8) == [Box(0, 24, 8, 32), Box(16, 40, 80, 100)]
-    wanted[0, 36] = True
-    assert boxes(wanted, 10, 8) == [Box(0, 24, 8, 48), Box(16, 40, 80, 100)]
-    assert boxes(wanted, 50, 8) == [Box(0, 40, 0, 100)]
+    wanted[10, 20] = wanted[290, 595] = True
+    assert boxes(wanted, 0, 8) == [Box(8, 16, 16, 24), Box(288, 296, 592, 600)]
+    assert boxes(wanted, 10, 8) == [Box(0, 24, 8, 32), Box(280, 300, 584, 601)]
+    wanted[200, 20] = True  # below the first: one box is cheaper than two
+    assert boxes(wanted, 0, 8) == [Box(8, 208, 16, 24), Box(288, 296, 592, 600)]
+    wanted[10, 400] = True  # the three corners of 384 x 192 pixels
+    assert len(boxes(wanted, 0, 8)) == 3
+    assert boxes(wanted, 300, 8) == [Box(0, 300, 0, 601)]
     assert Box(8, 16, 16, 25).cut(torch.zeros(10, 25), 4).shape == (2, 3)
+
+
+def test_boxes_hold_what_is_wanted_and_do_not_touch() -> None:
+    for seed in range(20):
+        torch.manual_seed(seed)
+        wanted = torch.rand(256, 832) > 0.99999
+        found, left = boxes(wanted, 16, 16), wanted.clone()
+        for box in found:
+            box.cut(left).zero_()
+            assert all(edge % 16 == 0 or edge == size for edge, size in zip(box, (0, 256, 0, 832), strict=True))
+        assert not left.any()
+        assert not any(one.touches(other) for one, other in itertools.combinations(found, 2))
 
 
 def test_a_margin_below_nothing() -> None:

@@ -2,11 +2,11 @@
 
 import itertools
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import torch
 
+from vestcl.models._layers import tensors_in
 from vestcl.stages import REST
 
 
@@ -23,7 +23,7 @@ class BackwardWatch:
 
     def seen(self, name: str, result: Any) -> None:
         """Watch for the gradients of a stage's results; for `vestcl.stages.watched`."""
-        for tensor in _tensors(result):
+        for tensor in tensors_in(result):
             if tensor.requires_grad:
                 tensor.register_hook(lambda _: self._began.append((time.perf_counter(), name)))
 
@@ -35,12 +35,3 @@ class BackwardWatch:
         for (start, name), (end, _) in itertools.pairwise(began):
             seconds[name] = seconds.get(name, 0.0) + end - start
         return seconds
-
-
-def _tensors(value: Any) -> Iterator[torch.Tensor]:
-    """Those in tuples and lists, however deep."""
-    if isinstance(value, torch.Tensor):
-        yield value
-    elif isinstance(value, tuple | list):
-        for part in value:
-            yield from _tensors(part)

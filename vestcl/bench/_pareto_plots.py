@@ -3,22 +3,19 @@
 `knob_figure` and `front_figure` are what notebook 04 draws with, too.
 """
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from vestcl.bench._plots import file_name
+from vestcl.bench._plots import blank, file_name, write
 from vestcl.bench._results import Results
-from vestcl.io import atomic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Inches of a figure of two axes, and dots an inch: 1,500 px wide.
-_SIZE: Final = (10.0, 4.2)
-_DOTS: Final = 150
+#: Inches of a figure of two axes: its height and width.
+_SIZE: Final = (4.2, 10.0)
 
 _COLOUR: Final = "#30638e"
 _MARKED: Final = "#d1495b"
@@ -37,15 +34,15 @@ def draw(results: Sequence[Results], folder: Path) -> list[Path]:
     for number, result in enumerate(results):
         prefix = f"{number} " if len(results) > 1 else ""
         for name, knob in result.details["knobs"].items():
-            written.append(_write(knob_figure(name, knob), folder / file_name(f"{prefix}{name}")))
+            written.append(write(knob_figure(name, knob), folder / file_name(f"{prefix}{name}")))
         if "front" in result.details:
-            written.append(_write(front_figure(result.details["front"]), folder / file_name(f"{prefix}front")))
+            written.append(write(front_figure(result.details["front"]), folder / file_name(f"{prefix}front")))
         if "splatter" in result.details:
             figure = splatter_figure(result.details["splatter"])
-            written.append(_write(figure, folder / file_name(f"{prefix}splatter")))
+            written.append(write(figure, folder / file_name(f"{prefix}splatter")))
         if "recursion" in result.details:
             figure = recursion_figure(result.details["recursion"])
-            written.append(_write(figure, folder / file_name(f"{prefix}recursion")))
+            written.append(write(figure, folder / file_name(f"{prefix}recursion")))
     return written
 
 
@@ -56,7 +53,7 @@ def knob_figure(name: str, knob: Mapping[str, Any]) -> "Figure":
         name: of the knob.
         knob: of the results' ``details["knobs"]``.
     """
-    figure = _figure()
+    figure = blank(*_SIZE)
     left, right = figure.subplots(1, 2)
     points = knob["points"]
     for axes, key, label in ((left, "rms", "rms difference from float64"), (right, "loss", "PSNR lost, dB")):
@@ -78,7 +75,7 @@ def front_figure(together: Mapping[str, Any]) -> "Figure":
     Args:
         together: the results' ``details["front"]``.
     """
-    figure = _figure()
+    figure = blank(*_SIZE)
     axes = figure.subplots()
     points = together["points"]
     _scatter(axes, points, "loss", line=False)
@@ -107,7 +104,7 @@ def splatter_figure(knobs: Mapping[str, Sequence[Mapping[str, Any]]]) -> "Figure
     Args:
         knobs: the results' ``details["splatter"]``.
     """
-    figure = _figure()
+    figure = blank(*_SIZE)
     titles = {"fragments": "fragments kept a pixel (torch's compositing)", "tile": "side of a tile, px"}
     for axes, (name, title) in zip(figure.subplots(1, len(titles)), titles.items(), strict=True):
         points = [{**choice, "rms": choice["error"]} for choice in knobs[name]]
@@ -126,7 +123,7 @@ def recursion_figure(rows: Sequence[Mapping[str, Any]]) -> "Figure":
     Args:
         rows: the results' ``details["recursion"]``.
     """
-    figure = _figure()
+    figure = blank(*_SIZE)
     axes = figure.subplots()
     axes.margins(*_ROOM)
     for mode in dict.fromkeys(row["mode"] for row in rows):
@@ -172,16 +169,3 @@ def _name(axes: "Axes", points: Sequence[Mapping[str, Any]], key: str) -> None:
     for point in points:
         place = point["seconds"]["median"] * 1e3, _value(point, key)
         axes.annotate(point["value"], place, (5, 5), textcoords="offset points", fontsize=8)
-
-
-def _figure() -> "Figure":
-    from matplotlib.figure import Figure  # its canvas is Agg's: no window, no state
-
-    return Figure(figsize=_SIZE, dpi=_DOTS, layout="constrained")
-
-
-def _write(figure: "Figure", path: Path) -> Path:
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    atomic.write_bytes(path, content.getvalue())
-    return path

@@ -29,7 +29,7 @@ _BAND: Final = 0.2
 _ROOM: Final = 1.18
 
 #: Points of a title: a device's name fits on a line.
-_TITLE: Final = 10
+TITLE: Final = 10
 
 #: As many names as fit beside each other.
 _LEGEND_COLUMNS: Final = 3
@@ -71,19 +71,19 @@ def curves(
     """
     if not lines:
         raise ValueError("`lines` must be one or more, got none")
-    figure = _figure(_SIZE[1])
+    figure = blank(_SIZE[1])
     axes = figure.subplots()
     for number, line in enumerate(lines):
         median, low, high = ([getattr(y, name) * line.scale for y in line.y] for name in ("median", "low", "high"))
         style, marker = "--" if line.dashed else "-", _MARKERS[number % len(_MARKERS)]
         drawn = axes.plot(line.x, median, label=line.name, markersize=5, linestyle=style, marker=marker)[0]
         axes.fill_between(line.x, low, high, alpha=_BAND, color=drawn.get_color(), linewidth=0)
-    axes.set_title(title, fontsize=_TITLE)
+    axes.set_title(title, fontsize=TITLE)
     axes.set(xlabel=x_label, ylabel=y_label, xscale="log", yscale="log")
     _label_ticks(axes, sorted({x for line in lines for x in line.x}) if ticks is None else ticks)
     axes.grid(alpha=0.3, which="both", linewidth=0.5)
     _legend(figure)
-    return _write(figure, path)
+    return write(figure, path)
 
 
 def bars(
@@ -114,7 +114,7 @@ def bars(
     if not names:
         raise ValueError("`groups` must have one or more bars, got none")
     thick = 0.8 / len(groups)
-    figure = _figure(1.2 + _BAR * max(len(names) * len(groups), 4))
+    figure = blank(1.2 + _BAR * max(len(names) * len(groups), 4))
     axes = figure.subplots()
     for number, (label, group) in enumerate(groups.items()):
         places = [names.index(name) + (number - (len(groups) - 1) / 2) * thick for name in group]
@@ -123,7 +123,7 @@ def bars(
         axes.barh(places, median, thick, xerr=around, label=label, error_kw={"elinewidth": 1})
         for place, value, end in zip(places, median, high, strict=True):
             axes.annotate(_short(value), (end, place), (3, 0), textcoords="offset points", va="center", size=7)
-    axes.set_title(title, fontsize=_TITLE)
+    axes.set_title(title, fontsize=TITLE)
     axes.set(xlabel=x_label, yticks=range(len(names)), yticklabels=names)
     ends = [spread.high * scale for group in groups.values() for spread in group.values()]
     if log:
@@ -137,7 +137,7 @@ def bars(
     axes.grid(axis="x", alpha=0.3, linewidth=0.5)
     if len(groups) > 1:
         _legend(figure)
-    return _write(figure, path)
+    return write(figure, path)
 
 
 def file_name(title: str) -> str:
@@ -146,10 +146,11 @@ def file_name(title: str) -> str:
     return f"{'-'.join(words)}.png"
 
 
-def _figure(height: float) -> "Figure":
+def blank(height: float, width: float = _SIZE[0]) -> "Figure":
+    """An empty figure, inches."""
     from matplotlib.figure import Figure  # its canvas is Agg's: no window, no state
 
-    return Figure(figsize=(_SIZE[0], height), dpi=_DOTS, layout="constrained")
+    return Figure(figsize=(width, height), dpi=_DOTS, layout="constrained")
 
 
 def _legend(figure: "Figure") -> None:
@@ -181,7 +182,12 @@ def _number(value: float, _: float) -> str:
     return f"{value:,.0f}" if float(value).is_integer() else f"{value:g}"
 
 
-def _write(figure: "Figure", path: Path) -> Path:
+def write(figure: "Figure", path: Path) -> Path:
+    """``figure`` as a PNG, which is replaced whole; ``path``.
+
+    Raises:
+        ValueError: the folder can't be made.
+    """
     content = io.BytesIO()
     figure.savefig(content, format="png")
     atomic.write_bytes(path, content.getvalue())

@@ -1,6 +1,5 @@
 """Each splat kernel beside the roofs of its device: `python -m vestcl.bench._roofline --plots DIR`."""
 
-import io
 import sys
 from dataclasses import dataclass
 from functools import partial
@@ -16,15 +15,13 @@ from vestcl.bench import _plots, _report, _results
 from vestcl.bench._results import Measure, Results
 from vestcl.bench._roofs import Roofline, roofline
 from vestcl.bench._scenes import street
-from vestcl.io import atomic
 from vestcl.scoring.tables import Grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Inches and dots an inch of the plot: two panels side by side, legible at half the size.
-_SIZE: Final = (11.0, 4.5)
-_DOTS: Final = 150
+#: Inches of the plot, two panels side by side: its height and width.
+_SIZE: Final = (4.5, 11.0)
 
 #: Columns of the tables where they don't go to a terminal, whose own number counts there.
 _WIDTH: Final = 160
@@ -101,9 +98,7 @@ def plot(path: Path, result: Roofline) -> Path:
     Raises:
         ValueError: the folder can't be made.
     """
-    from matplotlib.figure import Figure  # its canvas is Agg's: no window, no state
-
-    figure = Figure(figsize=_SIZE, dpi=_DOTS, layout="constrained")
+    figure = _plots.blank(*_SIZE)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     _draw_roofs(left, result)
     shares = [point.share for point in result.points]
@@ -113,11 +108,8 @@ def plot(path: Path, result: Roofline) -> Path:
     right.invert_yaxis()
     right.set(xlabel="share of the roof", xlim=(0, max(1.05, *(s.high for s in shares))))
     right.grid(axis="x", alpha=0.3, linewidth=0.5)
-    figure.suptitle(title_of(result), fontsize=10)
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    atomic.write_bytes(path, content.getvalue())
-    return path
+    figure.suptitle(title_of(result), fontsize=_plots.TITLE)
+    return _plots.write(figure, path)
 
 
 def _draw_roofs(axes: "Axes", result: Roofline) -> None:

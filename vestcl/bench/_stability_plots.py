@@ -1,23 +1,20 @@
 """The picture of `vestcl bench stability`: each family's errors over its knob, both on logarithmic axes."""
 
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from vestcl.bench._plots import file_name
+from vestcl.bench._plots import TITLE, blank, file_name, write
 from vestcl.bench._stability_cases import Family
-from vestcl.io import atomic
 
 #: Panels beside each other.
 _COLUMNS: Final = 4
 
-#: Inches of a panel, of title and legend, and of a figure that its title fits; dots an inch.
+#: Inches of a panel, of title and legend, and of a figure that its title fits.
 _PANEL: Final = (3.8, 3.1)
 _AROUND: Final = 1.2
 _LEAST_WIDTH: Final = 8.0
-_DOTS: Final = 130
 
 #: Errors below and above are drawn on the edge: a tenth of float32's rounding, and what has no digit right, nor size.
 _LIMITS: Final = (6e-9, 1e1)
@@ -47,26 +44,19 @@ def draw(rows: Sequence[Any], families: Sequence[Family], device: str, folder: P
     Raises:
         ValueError: the folder can't be made.
     """
-    from matplotlib.figure import Figure  # its canvas is Agg's: no window, no state
-
     columns = min(_COLUMNS, len(families))
     count = math.ceil(len(families) / columns)
-    size = (max(_LEAST_WIDTH, _PANEL[0] * columns), _PANEL[1] * count + _AROUND)
-    figure = Figure(figsize=size, dpi=_DOTS, layout="constrained")
+    figure = blank(_PANEL[1] * count + _AROUND, max(_LEAST_WIDTH, _PANEL[0] * columns))
     axes = list(figure.subplots(count, columns, squeeze=False).flat)
     for panel, family in zip(axes, families, strict=False):
         _panel(panel, family, [row for row in rows if row.family == family.name])
     for panel in axes[len(families) :]:
         panel.set_axis_off()
-    figure.suptitle(f"Relative error of float32 against float64, maximum norm\n{device}", fontsize=10)
+    figure.suptitle(f"Relative error of float32 against float64, maximum norm\n{device}", fontsize=TITLE)
     handles = {label: line for panel in axes for line, label in zip(*panel.get_legend_handles_labels(), strict=True)}
     pairs = math.ceil(len(handles) / 2)  # output above gradient
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=pairs, fontsize=8, frameon=False)
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    path = folder / file_name(f"stability {device}")
-    atomic.write_bytes(path, content.getvalue())
-    return path
+    return write(figure, folder / file_name(f"stability {device}"))
 
 
 def _panel(panel: Any, family: Family, rows: Sequence[Any]) -> None:

@@ -1,6 +1,5 @@
 """Bars in parts: where time goes, one variant below the other. matplotlib is imported late."""
 
-import io
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,16 +8,13 @@ from typing import Final
 
 import numpy as np
 
+from vestcl.bench._plots import TITLE, blank, write
 from vestcl.bench._timing import Spread
-from vestcl.io import atomic
 
 #: Inches: a plot's width, its height beside the bars, and what each bar adds.
 _WIDTH: Final = 9.0
 _AROUND: Final = 1.5
 _BAR: Final = 0.34
-
-#: Dots an inch: 1,350 px wide, so that letters are legible at half the size.
-_DOTS: Final = 150
 
 #: Room to the right of the longest bar for its number, a factor.
 _ROOM: Final = 1.18
@@ -59,9 +55,8 @@ def stacked_bars(path: Path, title: str, x_label: str, bars: Sequence[Bar], scal
     if not bars:
         raise ValueError("`bars` must be one or more, got none")
     from matplotlib import colormaps
-    from matplotlib.figure import Figure  # its canvas is Agg's: no window, no state
 
-    figure = Figure((_WIDTH, _AROUND + _BAR * len(bars)), dpi=_DOTS, layout="constrained")
+    figure = blank(_AROUND + _BAR * len(bars), _WIDTH)
     axes = figure.subplots()
     changes = [one.group != other.group for one, other in itertools.pairwise(bars)]
     places = np.arange(len(bars)) + _GAP * np.cumsum([0, *changes])
@@ -74,12 +69,10 @@ def stacked_bars(path: Path, title: str, x_label: str, bars: Sequence[Bar], scal
         low, median, high = (scale * value for value in (bar.whole.low, bar.whole.median, bar.whole.high))
         axes.plot([low, high], [place, place], color="black", linewidth=1)
         axes.annotate(f"{median:.3g}", (high, place), (4, 0), textcoords="offset points", va="center", size=8)
-    axes.set(title=title, xlabel=x_label, yticks=places, yticklabels=[bar.name for bar in bars])
+    axes.set_title(title, fontsize=TITLE)
+    axes.set(xlabel=x_label, yticks=places, yticklabels=[bar.name for bar in bars])
     axes.set_xlim(0, _ROOM * scale * max(bar.whole.high for bar in bars))
     axes.invert_yaxis()
     axes.grid(axis="x", alpha=0.3, linewidth=0.5)
     figure.legend(fontsize=8, ncols=8, loc="outside lower center")
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    atomic.write_bytes(path, content.getvalue())
-    return path
+    return write(figure, path)

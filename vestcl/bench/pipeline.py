@@ -92,9 +92,7 @@ def load(config: PipelineBench) -> Forecaster:
         model.autocast = torch.bfloat16 if config.precision == "bfloat16" else None
     if not config.accelerated:
         return model
-    fast = accelerate(model, "float32" if model.autocast is None else "bfloat16")
-    fast.effort = model.effort
-    return fast
+    return accelerate(model, "float32" if model.autocast is None else "bfloat16")
 
 
 def _check(config: PipelineBench) -> None:

@@ -92,8 +92,7 @@ def _borrowing(
     height, width = differs.shape[2:]
     parts = [Box(0, height, 0, width)]
     if skip.background:
-        margin = reach(config) if skip.margin is None else skip.margin
-        parts = boxes(differs.any(dim=0)[0], margin, COARSEST)
+        parts = boxes(differs.any(dim=0)[0], skip.around(reach(config)), COARSEST)
     else:
         rows = torch.arange(len(own))
     cells = functional.max_pool2d(differs[rows].to(own.dtype), STRIDE, ceil_mode=True) > 0

@@ -1,6 +1,7 @@
 """What several networks share: shapes checked at the boundary, normalisation, exact resizing, depth as an input."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import nn
@@ -115,3 +116,12 @@ def frame_pair(
     )  # fmt: skip
     log_prev, log_cur = (depth.clamp(LOG_DEPTH_NEAR, LOG_DEPTH_FAR).log() for depth in (depth_prev, depth_cur))
     return side_by_side([features_prev, log_prev, mask_prev]), side_by_side([features_cur, log_cur, mask_cur])
+
+
+def tensors_in(value: Any) -> Iterator[torch.Tensor]:
+    """Those in tuples and lists, however deep."""
+    if isinstance(value, torch.Tensor):
+        yield value
+    elif isinstance(value, tuple | list):
+        for part in value:
+            yield from tensors_in(part)

@@ -1,14 +1,24 @@
 """Object motion where there are objects."""
 
+import functools
 from collections.abc import Iterable
+from typing import Final
 
 import torch
+from torch.nn import functional
 
 from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
+from vestcl.models._motion import INTERVALS
 from vestcl.models.config import LOG_DEPTH_FAR
 from vestcl.models.ego_motion import CameraMotion
 from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
 from vestcl.models.skipping import Box, Skip, Tally, boxes
+
+#: What is slower, metres an interval, stands, as it does where velocities are measured ...
+SLOWEST: Final = 0.05
+
+#: ... in the mean over cells of so many pixels a side.
+_CELL: Final = 16
 
 
 def unmoved(start: torch.Tensor) -> ObjectMotionForecast:
@@ -39,13 +49,16 @@ def move_objects(
         to_next: the camera's motion from both.
         flow0: the rigid flow.
         start: what OMF corrects.
-        skip: with ``objects``, OMF runs around the foreground, if it is to move nothing else.
+        skip: with ``objects``, OMF runs around the foreground, if it is to move nothing else; with ``still`` around
+            what moves of it.
         tally: is told how much that left out.
         blocks: only the first so many run; None is all.
     """
     if blocks == 0:
         return unmoved(start)
     moving = torch.cat([frame.layers.mask < FOREGROUND_BELOW for frame in (prev, cur)], dim=1)
+    if skip.objects and skip.still and start is not flow0:
+        moving &= _rolling(moving, start - flow0)
     found = _where(network, moving, skip, tally, blocks)
     if not found:
         return unmoved(start)
@@ -60,8 +73,7 @@ def move_objects(
         *(frame.layers.mask for frame in (prev, cur)),
         near,
     ]
-    some = {} if blocks is None else {"blocks": blocks}
-    parts = [network(*map(box.cut, seen), **some) for box in found]
+    parts = [network(*map(box.cut, seen), blocks=blocks) for box in found]
     moves = moving.repeat_interleave(3, dim=1) if network.config.where == "foreground" else None
 
     def whole(pieces: Iterable[torch.Tensor]) -> torch.Tensor:
@@ -71,8 +83,21 @@ def move_objects(
         return flow + beyond if moves is None else torch.where(moves, flow + beyond, start)
 
     learning = torch.is_grad_enabled()  # losses alone look at candidates
-    candidates = [whole(some) for some in zip(*(part.candidates for part in parts), strict=True)] if learning else []
+    candidates = [whole(each) for each in zip(*(part.candidates for part in parts), strict=True)] if learning else []
     return parts[0]._replace(flow=whole(part.flow for part in parts), candidates=candidates)
+
+
+def _rolling(foreground: torch.Tensor, beside: torch.Tensor) -> torch.Tensor:
+    """bool [B, 2, H, W]: where what is ``foreground`` [B, 2, H, W] moves by SLOWEST an interval or more beside the
+    camera, ``beside`` [B, 6, H, W] m, in the mean over cells: some pixels of a parked car always seem to."""
+    height, width = foreground.shape[2:]
+    metres = torch.linalg.vector_norm(beside.unflatten(1, (2, 3)), dim=2) / beside.new_tensor(INTERVALS)[:, None, None]
+    share, moved = (
+        functional.avg_pool2d(plane, _CELL, ceil_mode=True)
+        for plane in (foreground.to(metres), torch.where(foreground, metres, 0))
+    )
+    rolling = moved >= SLOWEST * share
+    return functional.interpolate(rolling.to(metres), scale_factor=_CELL)[..., :height, :width] > 0
 
 
 def _where(network: ObjectMotion, moving: torch.Tensor, skip: Skip, tally: Tally, blocks: int | None) -> list[Box]:
@@ -81,10 +106,9 @@ def _where(network: ObjectMotion, moving: torch.Tensor, skip: Skip, tally: Tally
     whole = Box(0, height, 0, width)
     if network.config.where == "everywhere" or not skip.objects:
         return [whole]
-    margin = network.reach_of(blocks) if skip.margin is None else skip.margin
-    found = boxes(moving.flatten(0, 1).any(dim=0), margin, network.multiple)
+    found = boxes(moving.flatten(0, 1).any(dim=0), skip.around(network.reach_of(blocks)), network.multiple)
     if network.routing is not None and found:
-        found = [found[0].around(found[1:])]
+        found = [functools.reduce(Box.around, found)]
     if not found and network.learns:
         found = [Box(0, min(height, network.multiple), 0, min(width, network.multiple))]  # for a gradient of 0
     tally.add("objects", batch * (whole.pixels - sum(box.pixels for box in found)), batch * whole.pixels, "px")

@@ -164,11 +164,14 @@ def inner_holes(hole: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(np.stack([deep_holes(image) for image in hole.numpy()]))
 
 
-def _found(points_uv: torch.Tensor, starts: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
-    """bool [P]: which points [P, 2] px come to pixels of ``where`` [B, 1, H, W]; none from outside."""
+def _found(points_uv: torch.Tensor, starts: torch.Tensor, where: torch.Tensor, around: int = 0) -> torch.Tensor:
+    """bool [P]: which points [P, 2] px come to pixels of ``where`` [B, 1, H, W].
+
+    From up to ``around`` px outside, the nearest pixel counts; from farther away none is found.
+    """
     height, width = where.shape[2:]
-    column, row = points_uv.nan_to_num(-1).floor().long().unbind(1)
-    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    column, row = points_uv.nan_to_num(-1 - around).floor().long().unbind(1)
+    inside = (row >= -around) & (row < height + around) & (column >= -around) & (column < width + around)
     image = torch.arange(len(where)).repeat_interleave(starts.diff())
     place = (image * height + row.clamp(0, height - 1)) * width + column.clamp(0, width - 1)
     return inside & where.flatten()[place]
@@ -183,15 +186,10 @@ def _reaching(points_uv: torch.Tensor, radii: torch.Tensor, starts: torch.Tensor
         starts: [B + 1].
         open_: bool [B, 1, H, W].
     """
-    height, width = open_.shape[2:]
-    around = math.ceil(radii.max().item()) + 1 if len(radii) else 1
+    around = math.ceil(radii.nan_to_num(0).max().item()) + 1 if len(radii) else 1
     wide = functional.max_pool2d(open_.to(radii), (2 * around + 1, 1), stride=1, padding=(around, 0))
     wide = functional.max_pool2d(wide, (1, 2 * around + 1), stride=1, padding=(0, around))
-    column, row = points_uv.nan_to_num(-1).floor().long().unbind(1)
-    inside = (row >= -around) & (row < height + around) & (column >= -around) & (column < width + around)
-    image = torch.arange(len(open_)).repeat_interleave(starts.diff())
-    place = (image * height + row.clamp(0, height - 1)) * width + column.clamp(0, width - 1)
-    return (inside & (wide.flatten()[place] > 0)).nonzero()[:, 0]
+    return _found(points_uv, starts, wide > 0, around).nonzero()[:, 0]
 
 
 def _surface(

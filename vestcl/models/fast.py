@@ -10,20 +10,19 @@ import ctypes
 import inspect
 import platform
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 import torch
-from torch import nn
 from torch.nn import functional
 
+from vestcl.models._layers import tensors_in
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.object_motion import (
     MOTION_CHANNELS,
     MotionBlock,
     MotionConv,
     ObjectMotion,
-    ObjectMotionForecast,
 )
 
 __all__ = ["FastForecaster", "Precision", "accelerate", "computes_bfloat16", "keep_freed_memory", "share_frames"]
@@ -96,7 +95,6 @@ class FastForecaster(Forecaster):
         self.skip, self.effort = model.skip, model.effort
         self.autocast = torch.bfloat16 if precision == "bfloat16" else None
         if self.object_motion is not None:
-            self.object_motion.register_forward_hook(_without_candidates)
             share_frames(self.object_motion)
         self.eval()
         for parameter in self.parameters():
@@ -143,24 +141,11 @@ class FastForecaster(Forecaster):
 def _without_gradient(task: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
     if torch.is_grad_enabled():
         for name, value in inspect.signature(task).bind(*arguments, **named).arguments.items():
-            if any(tensor.requires_grad for tensor in _tensors(value)):
+            if any(tensor.requires_grad for tensor in tensors_in(value)):
                 wanted = f"`{name}` must not require a gradient, which an accelerated forecaster does not record"
                 raise ValueError(f"{wanted}; got one that does: use the plain model, or torch.no_grad()")
     with torch.no_grad():
         return task(*arguments, **named)
-
-
-def _tensors(value: Any) -> Iterator[torch.Tensor]:
-    """Those in tuples and lists, however deep."""
-    if isinstance(value, torch.Tensor):
-        yield value
-    elif isinstance(value, tuple | list):
-        for part in value:
-            yield from _tensors(part)
-
-
-def _without_candidates(_: nn.Module, __: Any, forecast: ObjectMotionForecast) -> ObjectMotionForecast:
-    return forecast._replace(candidates=[])
 
 
 # ---------------------------------------------------------------- object motion

@@ -1,15 +1,19 @@
 """What a scene does not need, and so is not computed: the switches, and what they saved."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+import cv2
 import torch
+from torch.nn import functional
+
+#: Two boxes become one if that adds fewer pixels: a pass through a network costs about as much as so many of them.
+_PASS: Final = 16384
 
 
 @dataclass(frozen=True)
 class Skip:
-    """Switches. With ``margin`` None each of them changes nothing but rounding."""
+    """Switches. With ``margin`` None and ``still`` off each of them changes nothing but rounding."""
 
     seen: bool = True
     """A frame that was encoded by the step before is not encoded again. (Where gradients are recorded, it is.)"""
@@ -23,10 +27,17 @@ class Skip:
     """A camera that is asked for twice is shown once."""
     margin: int | None = None
     """Pixels around the foreground that both are computed with; None is as far as the networks' convolutions reach."""
+    still: bool = False
+    """With ``objects``, things that were measured to stand are taken to stand: object motion is forecast around what
+    moves."""
 
     def __post_init__(self) -> None:
         if self.margin is not None and self.margin < 0:
             raise ValueError(f"`margin` must be 0 px or more, or None, got {self.margin}")
+
+    def around(self, reach: int) -> int:
+        """``margin`` in pixels, of a network that reaches so far."""
+        return reach if self.margin is None else self.margin
 
 
 #: Everything is computed.
@@ -65,15 +76,17 @@ class Box(NamedTuple):
     def pixels(self) -> int:
         return (self.bottom - self.top) * (self.right - self.left)
 
-    def around(self, others: "Iterable[Box]") -> "Box":
-        """The smallest box that holds this one and ``others``."""
-        every = [self, *others]
+    def around(self, other: "Box") -> "Box":
+        """The smallest box that holds this one and ``other``."""
         return Box(
-            min(b.top for b in every),
-            max(b.bottom for b in every),
-            min(b.left for b in every),
-            max(b.right for b in every),
-        )
+            min(self.top, other.top), max(self.bottom, other.bottom),
+            min(self.left, other.left), max(self.right, other.right),
+        )  # fmt: skip
+
+    def touches(self, other: "Box") -> bool:
+        """Whether they have a pixel in common, or an edge."""
+        rows = self.top <= other.bottom and other.top <= self.bottom
+        return rows and self.left <= other.right and other.left <= self.right
 
     def cut(self, image: torch.Tensor, cell: int = 1) -> torch.Tensor:
         """The part of ``image`` [..., H / cell, W / cell], of cells of ``cell`` pixels; a view."""
@@ -84,28 +97,47 @@ class Box(NamedTuple):
 def boxes(wanted: torch.Tensor, margin: int, align: int) -> list[Box]:
     """Boxes that together hold all of ``wanted`` with ``margin`` around it; they don't touch.
 
+    Regions of cells that touch get a box each; boxes that touch, or that one pass is cheaper for, become one.
+
     Args:
         wanted: bool [H, W].
         margin: px, cut off at the picture's edges.
-        align: edges are multiples of it, or the picture's.
+        align: px, a cell's side; edges are multiples of it, or the picture's.
 
     Returns:
-        From left to right; none where nothing is wanted.
+        By their left edges; none where nothing is wanted.
     """
     height, width = wanted.shape
-    found: list[tuple[int, int]] = []
-    for column in wanted.any(dim=0).nonzero()[:, 0].tolist():
-        left, right = _aligned(column, column + 1, width, margin, align)
-        if found and left <= found[-1][1]:
-            left, right = found.pop()[0], right
-        found.append((left, right))
-    result = []
-    for left, right in found:
-        rows = wanted[:, left:right].any(dim=1).nonzero()[:, 0]
-        top, bottom = _aligned(int(rows[0]), int(rows[-1]) + 1, height, margin, align)
-        result.append(Box(top, bottom, left, right))
-    return result
+    cells = functional.max_pool2d(wanted[None, None].float(), align, ceil_mode=True)[0, 0].byte().numpy()
+    stats = cv2.connectedComponentsWithStats(cells, connectivity=8)[2]
+    found = list[Box]()
+    for left, top, columns, rows, _ in stats[1:].tolist():
+        part = wanted[top * align : (top + rows) * align, left * align : (left + columns) * align]
+        sides = [
+            _aligned(start * align + along.nonzero()[:, 0], size, margin, align)
+            for start, along, size in ((top, part.any(dim=1), height), (left, part.any(dim=0), width))
+        ]
+        found.append(Box(*sides[0], *sides[1]))
+    return sorted(_joined(found), key=lambda box: (box.left, box.top))
 
 
-def _aligned(start: int, end: int, size: int, margin: int, align: int) -> tuple[int, int]:
-    return max(0, (start - margin) // align * align), min(size, -(-(end + margin) // align) * align)
+def _joined(found: list[Box]) -> list[Box]:
+    """Until no two of them touch or would cost more than one around both."""
+    done = list[Box]()
+    while found:
+        box = found.pop()
+        for other in done:
+            both = box.around(other)
+            if box.touches(other) or both.pixels < box.pixels + other.pixels + _PASS:
+                done.remove(other)
+                found.append(both)
+                break
+        else:
+            done.append(box)
+    return done
+
+
+def _aligned(places: torch.Tensor, size: int, margin: int, align: int) -> tuple[int, int]:
+    """Start and end of all ``places``, in order, with ``margin`` around them."""
+    start, end = int(places[0]) - margin, int(places[-1]) + 1 + margin
+    return max(0, start // align * align), min(size, -(-end // align) * align)
