@@ -11,7 +11,7 @@ import torch
 from tolerances import assert_close
 
 from vestcl import reference
-from vestcl.bench import _fragments, _measure, _peers, _scenes, _timing, splat
+from vestcl.bench import _fragments, _measure, _peers, _results, _scenes, _timing, splat
 
 #: Nothing runs longer than its least number of rounds.
 TINY: dict[str, Any] = {"height": 24, "width": 50, "seconds": 1e-3, "compile": False}
@@ -101,9 +101,9 @@ def test_without_a_compiler_the_peers_run_as_they_are(
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "splat.json"
-    splat.write_json(path, {"a": 1})
+    _results.write_json(path, {"a": 1})
     with pytest.raises(TypeError):
-        splat.write_json(path, {"a": object()})
+        _results.write_json(path, {"a": object()})
     assert json.loads(path.read_text(encoding="utf-8")) == {"a": 1}
     assert list(tmp_path.iterdir()) == [path]
 

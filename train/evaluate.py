@@ -31,7 +31,7 @@ from train.evaluate_windows import PART_WINDOWS, Part, Setup, known_of, plan, pr
 from train.protocols import HELD_OUT, PROTOCOLS, Name, Protocol, Source, Where
 from train.ranks import Ranks
 from vestcl import __version__, runtime
-from vestcl.bench.splat import describe
+from vestcl.bench import _results
 from vestcl.io.atomic import write_bytes
 from vestcl.metrics import MS_SSIM_SIDE
 from vestcl.models.forecaster import Forecaster, Mode
@@ -126,7 +126,7 @@ def evaluate(config: Evaluation) -> None:
     sources = protocol.sources(_where(config, protocol))
     about = _about(config, protocol)
     parts = plan(sources, protocol, setup.steps, config.every, out / "clips", _key(about))
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = _results.console(WIDTH)
     device = config.device or Ranks(local=int(os.environ.get("LOCAL_RANK", "0"))).device()
     with runtime.use(device) as session:
         if not config.merge:
@@ -141,7 +141,7 @@ def evaluate(config: Evaluation) -> None:
             return
         notes = (known_of(prepared(sources[0].opens(), setup)), *_caveats(config, setup))
         results = report.Results(protocol, records, protocol.shown, tuple(setup.models), notes)
-        _write(out, results, about | {"machine": describe(session)}, console)
+        _write(out, results, about | {"machine": _results.describe(session)}, console)
         if config.sheets:
             _sheets(out, sources, setup, results, console)
 

@@ -93,6 +93,8 @@ class Demo:
     """Which street."""
     model: str | None = None
     """vest-s, a .safetensors file, a checkpoint's folder, or geometric. Without it: vest-s, where it is installed."""
+    quality: Literal["exact", "balanced", "fast"] = "balanced"
+    """How exactly the network computes."""
     device: str | None = None
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
 
@@ -101,7 +103,7 @@ class Demo:
         from vestcl import demo
 
         with runtime.use(self.device):
-            demo.run(self.out, self.height, self.width, self.seed, self.model)
+            demo.run(self.out, self.height, self.width, self.seed, self.model, self.quality)
         return 0
 
 

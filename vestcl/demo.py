@@ -18,7 +18,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from vestcl import baselines, forecast_files, geometric, metrics, network, pretrained, sheet
+from vestcl import baselines, forecast_files, geometric, metrics, network, pretrained, quality, sheet
 from vestcl.compare import FORECAST
 from vestcl.data import Street
 from vestcl.data.sample import Clip
@@ -51,7 +51,15 @@ NETWORK: Final = "vest-s"
 Image = NDArray[np.float32]
 
 
-def run(out: Path, height: int, width: int, seed: int, model: str | None = None, steps: int = 5) -> None:
+def run(
+    out: Path,
+    height: int,
+    width: int,
+    seed: int,
+    model: str | None = None,
+    level: quality.Quality = quality.USUAL,
+    steps: int = 5,
+) -> None:
     """Forecast one street from three cameras, compare with what then happens there, and write it all.
 
     Args:
@@ -61,13 +69,14 @@ def run(out: Path, height: int, width: int, seed: int, model: str | None = None,
         seed: of the street.
         model: NETWORK or any other that `vestcl.pretrained.load_model` knows, or GEOMETRIC; None is NETWORK where this
             installation has it, else GEOMETRIC.
+        level: how exactly the network computes.
         steps: frames to forecast.
 
     Raises:
         ValueError: no such model.
     """
     name = model or (NETWORK if NETWORK in pretrained.shipped() else GEOMETRIC)
-    forecaster = None if name == GEOMETRIC else pretrained.load_model(name)
+    forecaster = None if name == GEOMETRIC else quality.load(name, level)
     console, street = Console(), Street.generate(seed)
     clip = street.clip(CONTEXT + steps, height, width, start=START, fps=FPS, samples=SAMPLES)
     seen, index = stereo_only(clip), CONTEXT - 1
@@ -82,7 +91,7 @@ def run(out: Path, height: int, width: int, seed: int, model: str | None = None,
         scores = {view.name: _scores(forecasts, truth[view.name], clip, index, view) for view in views}
         sheets = {view.name: sheet.forecast_sheet([frame[view.name] for frame in forecast.frames]) for view in views}
         settings: dict[str, Any] = {"height": height, "width": width, "model": name}
-        settings |= {} if forecaster is None else pretrained.about_model(name)
+        settings |= {} if forecaster is None else {**pretrained.about_model(name), **quality.about(level)}
         about = forecast_files.Details(f"street:{seed}", settings, scores, sheets)
         forecast_files.write_forecast(out, forecast, seen, index, views, about)
         write_pixels(out / "sheet.png", _sheet(perception, index, forecast, truth))

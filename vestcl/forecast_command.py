@@ -86,7 +86,7 @@ def run(options: "cli.Forecast") -> None:
         stages = _Stages(bar)
         with stages.stage("open the clip"):
             level = options.quality or quality.USUAL
-            model = None if options.model is None else quality.apply(pretrained.load_model(options.model), level)
+            model = None if options.model is None else quality.load(options.model, level)
             clip = open_clip(options)
             index = current_frame(clip, options)
             views = parse_views(options.view or ("source",), clip[index])

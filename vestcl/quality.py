@@ -8,12 +8,14 @@
 """
 
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, get_args
 
 import torch
 
+from vestcl import pretrained
 from vestcl.models.effort import Effort
-from vestcl.models.fast import computes_bfloat16
+from vestcl.models.fast import FastForecaster, accelerate, computes_bfloat16, keep_freed_memory
 from vestcl.models.skipping import Skip
 
 if TYPE_CHECKING:
@@ -42,8 +44,10 @@ class Settings(NamedTuple):
 
 _SETTINGS: Final[dict[Quality, Settings]] = {
     "exact": Settings(Skip(), Effort(), None),
-    "balanced": Settings(Skip(margin=32), Effort(min_transmittance=0.01), "bfloat16"),
-    "fast": Settings(Skip(margin=16), Effort(min_transmittance=0.03, blocks=1, paint_scale=0.5), "bfloat16"),
+    "balanced": Settings(Skip(margin=32, still=True), Effort(min_transmittance=0.01, paint_scale=0.5), "bfloat16"),
+    "fast": Settings(
+        Skip(margin=16, still=True), Effort(min_transmittance=0.03, blocks=1, paint_scale=0.25), "bfloat16"
+    ),
 }
 
 
@@ -96,3 +100,19 @@ def apply(model: "Forecaster", quality: Quality) -> "Forecaster":
     model.skip, model.effort = skip, effort
     model.autocast = getattr(torch, autocast) if autocast and computes_bfloat16() else None
     return model
+
+
+def load(name_or_path: str | Path, quality: Quality) -> FastForecaster:
+    """A trained network as commands use it: at ``quality``, laid out for inference; the process keeps what it frees.
+
+    Args:
+        name_or_path: see `vestcl.pretrained.load_model`.
+        quality: one of `LEVELS`.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no such model, a damaged file, or another word.
+    """
+    keep_freed_memory()
+    model = apply(pretrained.load_model(name_or_path), quality)
+    return accelerate(model, "float32" if model.autocast is None else "bfloat16")

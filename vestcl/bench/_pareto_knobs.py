@@ -98,6 +98,9 @@ def knobs(model: Forecaster) -> list[Knob]:
     if config.encoder.background == "frame" or (config.object_motion and config.object_motion.where == "foreground"):
         values = tuple((f"{_text(m)}", Setting(Skip(margin=m))) for m in (None, 128, 64, 32, 16, 0))
         found.append(Knob("margin", "pixels around the foreground that are computed with it", values))
+    if config.object_motion is not None and config.object_motion.where == "foreground":
+        values = ("forecast anew", EXACT), ("taken to stand", Setting(Skip(still=True)))
+        found.append(Knob("still", "things that were measured to stand", values))
     return found
 
 

@@ -51,7 +51,7 @@ class Variant:
 
 def variants(skip: Skip) -> list[Variant]:
     """Nothing skipped, each switch that is on in ``skip`` alone, and all of them."""
-    nothing = dataclasses.replace(NOTHING, margin=skip.margin)
+    nothing = dataclasses.replace(NOTHING, margin=skip.margin, still=skip.still)
     found = [Variant(NONE, nothing), Variant(TWICE, nothing, twice=True)]
     for switch in SWITCHES:
         twice = switch == "views"

@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import sys
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -27,6 +28,9 @@ ALL: Final = "all"
 #: What a measure's name ends with where it is another's time as a multiple of a copy of the same bytes, timed in turns
 #: with it. `vestcl bench compare` trusts it more than seconds: what slows the machine down slows the copy, too.
 X_COPY: Final = ", x copy"
+
+#: Columns of tables that don't go to a terminal.
+WIDTH: Final = 140
 
 #: Of the files: the value of "vestcl".
 _FORMAT: Final = 1
@@ -144,6 +148,21 @@ def _usable(console: Console) -> list[str]:
 
 def _report(console: Console, info: runtime.DeviceInfo, reason: str) -> None:
     console.print(Text(f"{info.index} {info.platform} / {info.name} left out: {reason}", "red"), soft_wrap=True)
+
+
+def console(width: int = WIDTH) -> Console:
+    """Standard output: a terminal of its own width, or a file of ``width`` columns."""
+    return Console(width=None if sys.stdout.isatty() else width)
+
+
+def write_json(path: Path, results: dict[str, Any]) -> None:
+    """Write ``results`` whole or not at all; ``path`` is the old file until then.
+
+    Raises:
+        TypeError: something that JSON does not have.
+        ValueError: the folder can't be made.
+    """
+    atomic.write_bytes(path, (json.dumps(results, indent=1) + "\n").encode())
 
 
 def describe(session: runtime.Session) -> dict[str, str]:

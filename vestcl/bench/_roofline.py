@@ -1,6 +1,5 @@
 """Each splat kernel beside the roofs of its device: `python -m vestcl.bench._roofline --plots DIR`."""
 
-import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -8,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import tyro
-from rich.console import Console
 
 from vestcl import runtime
 from vestcl.bench import _plots, _report, _results
@@ -144,7 +142,7 @@ def main(config: RooflineBench) -> None:
             raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
     if not config.radii or min(config.radii) <= 0:
         raise ValueError(f"`radii` must be one or more positive numbers, got {config.radii}")
-    console = Console(width=None if sys.stdout.isatty() else _WIDTH)
+    console = _results.console(_WIDTH)
     results = _results.measure_each(config.device, partial(_measure_device, config), console)
     _results.show(results, console)
     _results.save(results, config.json, config.markdown)

@@ -5,19 +5,16 @@ the same bytes beside it, that ratio must have changed in the same direction, to
 """
 
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
 import tyro
-from rich.console import Console
 from rich.text import Text
 
 from vestcl.bench import _report, _results
 from vestcl.bench._results import X_COPY, Measure, Results
-from vestcl.bench.splat import WIDTH
 from vestcl.io import atomic
 from vestcl.scoring.tables import Grid, to_markdown
 
@@ -74,7 +71,7 @@ def main(config: CompareBench) -> int:
     """
     if config.fail_above is not None and not config.fail_above >= 0:
         raise ValueError(f"`fail_above` must be 0 or more, got {config.fail_above}")
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = _results.console()
     grids, failed = [], []
     for before, after in pairs(_results.load(config.before), _results.load(config.after)):
         for warning in warnings(before, after):

@@ -5,7 +5,6 @@ Seeds of `HELD_OUT` are for this bench: no test and no training may use them.
 
 import dataclasses
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +18,8 @@ from vestcl import runtime
 from vestcl.bench import _forecast_tables as tables
 from vestcl.bench import _forecast_truth as known
 from vestcl.bench import _forecast_windows as windows
+from vestcl.bench import _results
 from vestcl.bench._forecast_truth import Facts
-from vestcl.bench.splat import describe, write_json
 from vestcl.data import Street
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
@@ -99,9 +98,9 @@ def main(config: ForecastBench) -> None:
         DeviceError: no such device.
     """
     _check(config)
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = _results.console(WIDTH)
     with runtime.use(config.device) as session:
-        machine = describe(session)
+        machine = _results.describe(session)
         trunk = None if config.squeeze is None else load_trunk("squeezenet1_0", config.squeeze)
         groups = _groups(config)
         _run(groups, config, trunk, console)
@@ -249,7 +248,9 @@ def _write(
 ) -> None:  # fmt: skip
     if config.out is not None:
         settings = {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(config).items()}
-        write_json(config.out, {"machine": machine, "config": settings, "inputs": [_told(group) for group in groups]})
+        _results.write_json(
+            config.out, {"machine": machine, "config": settings, "inputs": [_told(group) for group in groups]}
+        )
         console.print(f"wrote {config.out}", soft_wrap=True, highlight=False)
     if config.markdown is not None:
         write_bytes(config.markdown, "\n".join(map(tables.to_markdown, grids)).encode())

@@ -13,7 +13,7 @@ from rich.progress import track
 from rich.table import Table
 
 from vestcl import runtime
-from vestcl.bench.splat import describe, write_json
+from vestcl.bench._results import describe, write_json
 from vestcl.data import Street, intrinsics
 from vestcl.data.raycast import SKY_DEPTH as STREET_SKY
 from vestcl.io.labels import background

@@ -18,9 +18,8 @@ from rich.table import Table
 from torch import nn
 
 from vestcl import runtime
-from vestcl.bench import _timing
+from vestcl.bench import _results, _timing
 from vestcl.bench._timing import Spread
-from vestcl.bench.splat import WIDTH, describe, write_json
 from vestcl.data import Frame, Street, intrinsics
 from vestcl.data.raycast import SKY_DEPTH
 from vestcl.io.labels import background
@@ -158,9 +157,9 @@ def main(config: NetworkBench) -> None:
         if getattr(config, name) <= 0:
             raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
     model_config = configuration(config.model)
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = _results.console()
     with runtime.use(config.device) as session, _timing.torch_threads(config.threads):
-        machine = describe(session)
+        machine = _results.describe(session)
         for name, value in machine.items():
             console.print(f"{name}: {value}", soft_wrap=True, highlight=False)
         torch.manual_seed(config.seed)
@@ -170,7 +169,7 @@ def main(config: NetworkBench) -> None:
     if config.json is not None:
         settings = dataclasses.asdict(config) | {"json": str(config.json)}
         results = {"machine": machine, "config": settings, "parts": [dataclasses.asdict(part) for part in parts]}
-        write_json(config.json, results)
+        _results.write_json(config.json, results)
         console.print(f"wrote {config.json}", soft_wrap=True)
 
 

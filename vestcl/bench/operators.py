@@ -1,6 +1,5 @@
 """`vestcl bench operators`: each operator beside its torch twin and a copy of the same bytes, forward and backward."""
 
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from vestcl.bench import _plots, _report, _results, _timing
 from vestcl.bench._results import X_COPY, Measure, Results
 from vestcl.bench._scenes import AHEAD
 from vestcl.bench._timing import Spread, Task
-from vestcl.bench.splat import CHANNELS, WIDTH
+from vestcl.bench.splat import CHANNELS
 from vestcl.data import Street, intrinsics
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
@@ -127,7 +126,7 @@ def main(config: OperatorsBench) -> None:
     for name in ("height", "width", "channels", "radius", "seconds", "threads"):
         if getattr(config, name) <= 0:
             raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = _results.console()
     with trace.record(config.trace), _timing.torch_threads(config.threads):
         results = _results.measure_each(config.device, partial(_measure_device, config, console), console)
     _results.save(results, config.json, config.markdown)

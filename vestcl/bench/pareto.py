@@ -1,13 +1,11 @@
 """`vestcl bench pareto`: what each knob of a forecast saves in time and costs in error, and the best together."""
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from vestcl import pretrained, quality, runtime
@@ -17,7 +15,6 @@ from vestcl.bench._pareto_knobs import EXACT, Knob, Setting, combinations, descr
 from vestcl.bench._pareto_measure import Bench, measure, recursions
 from vestcl.bench._pareto_scenes import scene
 from vestcl.bench._results import Results
-from vestcl.bench.splat import WIDTH
 from vestcl.models.fast import accelerate
 
 #: Horizons that the two ways of going on from t + 1 are compared at.
@@ -76,7 +73,7 @@ def main(config: ParetoBench) -> None:
     if not config.seeds:
         raise ValueError("`seeds` must be one or more streets, got none")
     pretrained.find_model(config.model)
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = _results.console()
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with (
         Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,

@@ -1,6 +1,5 @@
 """`vestcl bench pipeline`: a complete forecast step in empty streets and full ones, and what skipping saves of it."""
 
-import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +14,6 @@ from vestcl.bench._pipeline_measure import SceneTimes, measure_scene
 from vestcl.bench._results import Results
 from vestcl.bench._traffic import EMPTY, EVERYTHING, JAM, LEAST_FRAMES, TRAFFIC, drive
 from vestcl.bench.network import peak_gigabytes
-from vestcl.bench.splat import WIDTH
 from vestcl.models.fast import accelerate
 from vestcl.models.forecaster import Forecaster
 
@@ -71,7 +69,7 @@ def main(config: PipelineBench) -> None:
         DeviceError: no such device.
     """
     _check(config)
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = _results.console()
     model = load(config)
     with trace.record(config.trace), _timing.torch_threads(config.threads):
         results = _results.measure_each(config.device, partial(_measure_device, config, model, console), console)

@@ -2,9 +2,6 @@
 
 import contextlib
 import dataclasses
-import json
-import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,10 +12,10 @@ from rich.console import Console
 
 from vestcl import runtime, trace
 from vestcl.bench import _fragments, _kernels, _measure, _peers, _plots, _pytorch3d, _report, _results, _scenes, _timing
-from vestcl.bench._results import Measure, Results, describe
+from vestcl.bench._results import Measure, Results
 from vestcl.scoring.tables import Grid
 
-__all__ = ["WIDTH", "SplatBench", "describe", "main", "write_json"]
+__all__ = ["SplatBench", "main"]
 
 #: Channels of the features: what the encoder gives (SPEC section 3).
 CHANNELS: Final = 32
@@ -31,9 +28,6 @@ SIZES: Final = ((64, 208), (128, 416), (256, 832), (512, 1664), (1024, 3328))
 
 #: (height, width, radius) -> copies that forward, and forward + backward, may take.
 TARGETS: Final = {(256, 832, 1.0): (6.0, 8.0), (256, 832, 2.0): (10.0, 16.0)}
-
-#: Columns of the tables where they don't go to a terminal, whose own number counts there.
-WIDTH: Final = 140
 
 
 @dataclass(frozen=True)
@@ -88,7 +82,7 @@ def main(config: SplatBench) -> None:
         DeviceError: no such device.
     """
     _check(config)
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = _results.console()
     with trace.record(config.trace), _timing.torch_threads(config.threads):
         results = _results.measure_each(config.device, partial(_measure_device, config, console), console)
     _results.save(results, config.json, config.markdown)
@@ -105,7 +99,7 @@ def _check(config: SplatBench) -> None:
 
 def _measure_device(config: SplatBench, console: Console, session: runtime.Session) -> Results:
     """Everything on one device, printed as it comes."""
-    machine = describe(session)
+    machine = _results.describe(session)
     _results.show_machine(machine, console)
     parts = list(_parts(config, console))
     details = {key: value for part in parts for key, value in part.details.items()}
@@ -232,14 +226,3 @@ def _plot(folder: Path, info: runtime.DeviceInfo, details: dict[str, Any]) -> No
             _report.series_plot(path, f"splat over {over}\n{device}", details[name], over == "size")
     path = folder / _plots.file_name(f"splat kernels {info.index}")
     _report.kernel_plot(path, f"splat's kernels\n{device}", details["kernels"])
-
-
-def write_json(path: Path, results: dict[str, Any]) -> None:
-    """Write ``results`` under another name and rename: ``path`` is the old file or the new one, never half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

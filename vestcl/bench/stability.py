@@ -7,7 +7,6 @@ against it is in vestcl.bench._stability_bounds, and what others make of the sam
 """
 
 import contextlib
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,9 +23,6 @@ from vestcl.bench._stability_cases import FAMILIES, Case, Family
 from vestcl.bench._stability_peers import LEFT_OUT, peers_of
 from vestcl.bench._stability_programs import OPERATORS, Operators, Outcome, evaluate, relative_error
 from vestcl.scoring.tables import Grid, to_rich
-
-#: Columns of the tables where they don't go to a terminal, whose own number counts there.
-WIDTH: Final = 140
 
 _NORM: Final = "Errors are max |float32 - float64| / max |float64| over each array; shown is the worst array's."
 
@@ -117,7 +113,7 @@ def main(config: StabilityBench) -> int:
         DeviceError: no such device, or none with float64 for the truth.
     """
     families = _chosen(config)
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = _results.console()
     rows: list[list[Row]] = []
 
     def measure(session: runtime.Session) -> Results:

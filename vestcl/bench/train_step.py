@@ -1,6 +1,5 @@
 """`vestcl bench train-step`: a training step by stage, what gradients cost that nobody asks for, and torch's splat."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +17,6 @@ from vestcl.bench._traffic import LEAST_FRAMES, TRAFFIC, drive
 from vestcl.bench._train_measure import Batch, StepTimes, TwinTimes, measure_steps, measure_twin, stacked
 from vestcl.bench.network import peak_gigabytes
 from vestcl.bench.pipeline import SEED
-from vestcl.bench.splat import WIDTH
 from vestcl.models import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster
 from vestcl.scoring.tables import Grid
@@ -74,7 +72,7 @@ def main(config: TrainStepBench) -> None:
         if getattr(config, name) <= 0:
             raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
     model_config = configuration(config.model)
-    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    console = _results.console()
     with trace.record(config.trace), _timing.torch_threads(config.threads):
         results = _results.measure_each(config.device, partial(_measure_device, config, model_config, console), console)
     _results.save(results, config.json, config.markdown)

@@ -27,6 +27,9 @@ _TORN: Final = 2.5
 #: ahead of us would soon be behind the road that it was painted over.
 _BEHIND: Final = 4 * SKY_DEPTH
 
+#: Points are picked for open pixels where no more of a view is open than that: picking takes time, too.
+_OPEN: Final = 0.15
+
 #: Limits of a footprint's radius, px: half the splatter's tile, and where a footprint can miss every pixel centre.
 RADIUS: Final = (0.5, constants.TILE / 2)
 
@@ -137,11 +140,13 @@ def splat_cloud(
     if deep is not None:
         opacities = opacities * (~cloud.inpainted | _found(points_uv.detach(), starts, deep))
     if open_ is not None and tally is not None:
-        kept = _reaching(points_uv.detach(), radii.detach(), cloud.starts, open_)
+        kept = torch.arange(len(z))
+        if open_.float().mean() <= _OPEN:
+            kept = _reaching(points_uv.detach(), radii.detach(), cloud.starts, open_)
+            starts = torch.searchsorted(kept, starts)
+            cloud = cloud.picked(kept, starts)
+            points_uv, order, near, radii, opacities = (t[kept] for t in (points_uv, order, near, radii, opacities))
         tally.add("covered", len(z) - len(kept), len(z), "points")
-        starts = torch.searchsorted(kept, starts)
-        cloud = cloud.picked(kept, starts)
-        points_uv, order, near, radii, opacities = (t[kept] for t in (points_uv, order, near, radii, opacities))
     raster = rasterize(points_uv, order, radii, opacities, height, width, cloud_starts=starts)
     with torch.no_grad():
         known = cloud.background, last_motion(cloud, next_from_cur) / near[:, None]
