@@ -28,6 +28,11 @@ test: lint
 
 bench: venv
 	$(BIN)/vestcl bench splat
+	$(BIN)/vestcl bench operators
+	$(BIN)/vestcl bench stability
+	$(BIN)/vestcl bench pipeline
+	$(BIN)/vestcl bench train-step
+	$(BIN)/vestcl bench pareto
 	$(BIN)/vestcl bench inpaint
 	$(BIN)/vestcl bench network
 	$(BIN)/vestcl bench forecast street:

@@ -1,8 +1,9 @@
 """How good a forecast by a network has to be: three points on the curve of run time against error.
 
     exact      float32; skips what changes nothing but rounding
-    balanced   fastest of what stays within a step of 8 bits of exact (root mean square): at most 0.1 dB of PSNR worse
-    fast       the knees beyond that: details are refined more coarsely, and objects' motion by fewer blocks
+    balanced   the knees that cost at most 0.1 dB of PSNR: what was measured to stand stands, details are refined at
+               half the size
+    fast       beyond them: details at a quarter of it, objects' motion by one block
 
 `vestcl bench pareto` measures the curve; docs/time_against_error has it, and the points chosen.
 """

@@ -23,11 +23,11 @@ CHANNELS: Final = 32
 #: What ``--channels`` times: colour, colour and coverage, half the features, all, all that a side renders, twice.
 CHANNEL_SWEEP: Final = (3, 4, 16, 32, 37, 64)
 
-#: What ``--scaling`` times, each four times the pixels of the one before.
-SIZES: Final = ((64, 208), (128, 416), (256, 832), (512, 1664), (1024, 3328))
+#: What ``--scaling`` times, each four times the pixels of the one before, up to 8.4 million points.
+SIZES: Final = ((64, 208), (128, 416), (256, 832), (512, 1664), (1024, 3328), (2048, 4096))
 
 #: (height, width, radius) -> copies that forward, and forward + backward, may take.
-TARGETS: Final = {(256, 832, 1.0): (6.0, 8.0), (256, 832, 2.0): (10.0, 16.0)}
+TARGETS: Final = {(256, 832, 1.0): (4.0, 6.0), (256, 832, 2.0): (10.0, 16.0)}
 
 
 @dataclass(frozen=True)
