@@ -24,7 +24,7 @@ def results(*measures: Measure, bench: str = "splat", **machine: str) -> Results
 @pytest.fixture(autouse=True)
 def _wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "300")
-    monkeypatch.setattr(compare, "WIDTH", 300)
+    monkeypatch.setattr(_results, "WIDTH", 300)
 
 
 @pytest.fixture

@@ -45,7 +45,7 @@ class Settings(NamedTuple):
 
 _SETTINGS: Final[dict[Quality, Settings]] = {
     "exact": Settings(Skip(), Effort(), None),
-    "balanced": Settings(Skip(margin=32, still=True), Effort(min_transmittance=0.01, paint_scale=0.5), "bfloat16"),
+    "balanced": Settings(Skip(margin=16, still=True), Effort(min_transmittance=0.01, paint_scale=0.5), "bfloat16"),
     "fast": Settings(
         Skip(margin=16, still=True), Effort(min_transmittance=0.03, blocks=1, paint_scale=0.25), "bfloat16"
     ),

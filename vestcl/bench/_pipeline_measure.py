@@ -50,12 +50,12 @@ class Variant:
 
 
 def variants(skip: Skip) -> list[Variant]:
-    """Nothing skipped, each switch that is on in ``skip`` alone, and all of them."""
+    """Nothing skipped, each switch alone, and all that ``skip`` has on."""
     nothing = dataclasses.replace(NOTHING, margin=skip.margin, still=skip.still)
     found = [Variant(NONE, nothing), Variant(TWICE, nothing, twice=True)]
     for switch in SWITCHES:
         twice = switch == "views"
-        alone = dataclasses.replace(nothing, **{switch: getattr(skip, switch)})
+        alone = dataclasses.replace(nothing, **{switch: True})
         found.append(Variant(f"{switch} alone", alone, twice, TWICE if twice else NONE, switch))
     return [*found, Variant(ALL, skip, base=NONE)]
 

@@ -150,9 +150,9 @@ def _report(console: Console, info: runtime.DeviceInfo, reason: str) -> None:
     console.print(Text(f"{info.index} {info.platform} / {info.name} left out: {reason}", "red"), soft_wrap=True)
 
 
-def console(width: int = WIDTH) -> Console:
-    """Standard output: a terminal of its own width, or a file of ``width`` columns."""
-    return Console(width=None if sys.stdout.isatty() else width)
+def console(width: int | None = None) -> Console:
+    """Standard output: a terminal of its own width, or a file of ``width`` columns, None being WIDTH."""
+    return Console(width=None if sys.stdout.isatty() else width or WIDTH)
 
 
 def write_json(path: Path, results: dict[str, Any]) -> None:

@@ -3,8 +3,8 @@
     empty road      nothing but the static world
     traffic         the street as it is generated
     jam             slow, both lanes full
-    everything      no street: foreground scattered all over two walls, every frame another one, seen from the side, so
-                    that nothing can be skipped
+    everything      no street: foreground scattered all over two walls, all of it moving, every frame another one, seen
+                    from the side, so that nothing can be skipped
 
 Depth and masks are given, everything else is measured as in use: the camera's motion and things' velocities by
 `Perception`, outside of all timing.
@@ -39,6 +39,9 @@ LEAST_FRAMES: Final = 4
 
 #: Of a jam, m/s: walking pace.
 _JAM_SPEED: Final = 1.5
+
+#: Metres an interval along each axis that all of it moves: more than what `Skip.still` takes to stand.
+_MOVED: Final = 0.1
 
 #: The scene "everything": m to the wall and to what is scattered before it ...
 _WALL: Final = 10.0
@@ -132,7 +135,9 @@ def _scattered(frames: list[Prepared]) -> Iterator[Window]:
     pictures = [torch.from_numpy(frame.layers.image.copy())[None] for frame in frames[:2]]
     pictures += [picture.flip(3) for picture in pictures]
     for prev, cur in (pictures[:2], pictures[2:]):
-        given = NetworkInput(_dotted(prev), _dotted(cur), K, nothing_moves(cur))
+        moving = torch.full_like(cur, _MOVED)
+        prior = nothing_moves(cur)._replace(velocity_prev=moving, velocity_cur=moving)
+        given = NetworkInput(_dotted(prev), _dotted(cur), K, prior)
         yield Window(given, aside, None)
 
 

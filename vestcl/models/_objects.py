@@ -14,11 +14,11 @@ from vestcl.models.ego_motion import CameraMotion
 from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
 from vestcl.models.skipping import Box, Skip, Tally, boxes
 
-#: What is slower, metres an interval, stands, as it does where velocities are measured ...
-SLOWEST: Final = 0.05
+#: What is slower, metres an interval, stands: at 10 Hz half of a brisk walk ...
+SLOWEST: Final = 0.08
 
 #: ... in the mean over cells of so many pixels a side.
-_CELL: Final = 16
+_CELL: Final = 32
 
 
 def unmoved(start: torch.Tensor) -> ObjectMotionForecast:

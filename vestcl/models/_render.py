@@ -1,6 +1,5 @@
 """What a camera sees of the clouds: a splat of each, and what follows from both."""
 
-import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -142,7 +141,7 @@ def splat_cloud(
     if open_ is not None and tally is not None:
         kept = torch.arange(len(z))
         if open_.float().mean() <= _OPEN:
-            kept = _reaching(points_uv.detach(), radii.detach(), cloud.starts, open_)
+            kept = _reaching(points_uv.detach(), starts, open_)
             starts = torch.searchsorted(kept, starts)
             cloud = cloud.picked(kept, starts)
             points_uv, order, near, radii, opacities = (t[kept] for t in (points_uv, order, near, radii, opacities))
@@ -182,19 +181,18 @@ def _found(points_uv: torch.Tensor, starts: torch.Tensor, where: torch.Tensor, a
     return inside & where.flatten()[place]
 
 
-def _reaching(points_uv: torch.Tensor, radii: torch.Tensor, starts: torch.Tensor, open_: torch.Tensor) -> torch.Tensor:
-    """Indices of the points whose footprints may reach an open pixel, and some of their neighbours.
+def _reaching(points_uv: torch.Tensor, starts: torch.Tensor, open_: torch.Tensor) -> torch.Tensor:
+    """Indices of the points whose footprints may reach an open pixel, and some of their neighbours: of all that come to
+    a tile with one or beside it, which is farther than any radius.
 
     Args:
         points_uv: [P, 2] px.
-        radii: [P] px.
         starts: [B + 1].
         open_: bool [B, 1, H, W].
     """
-    around = math.ceil(radii.nan_to_num(0).max().item()) + 1 if len(radii) else 1
-    wide = functional.max_pool2d(open_.to(radii), (2 * around + 1, 1), stride=1, padding=(around, 0))
-    wide = functional.max_pool2d(wide, (1, 2 * around + 1), stride=1, padding=(0, around))
-    return _found(points_uv, starts, wide > 0, around).nonzero()[:, 0]
+    tiles = functional.max_pool2d(open_.to(points_uv), constants.TILE, ceil_mode=True)
+    wide = functional.max_pool2d(tiles, 3, stride=1, padding=1) > 0
+    return _found(points_uv / constants.TILE, starts, wide, around=1).nonzero()[:, 0]
 
 
 def _surface(

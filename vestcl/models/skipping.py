@@ -10,6 +10,9 @@ from torch.nn import functional
 #: Two boxes become one if that adds fewer pixels: a pass through a network costs about as much as so many of them.
 _PASS: Final = 16384
 
+#: From this share of a picture on boxes are not worth while.
+_WHOLE: Final = 0.6
+
 
 @dataclass(frozen=True)
 class Skip:
@@ -21,8 +24,9 @@ class Skip:
     """The background is encoded around what foreground hides, and not at all where there is none."""
     objects: bool = True
     """Object motion is forecast around the foreground, and not at all where there is none."""
-    covered: bool = True
-    """Of the previous frame's points those are splatted that come to where the current frame leaves something open."""
+    covered: bool = False
+    """Of the previous frame's points those are splatted that come to where the current frame leaves something open.
+    Off: to pick them takes as long as it saves (`vestcl bench pipeline`)."""
     views: bool = True
     """A camera that is asked for twice is shown once."""
     margin: int | None = None
@@ -97,7 +101,8 @@ class Box(NamedTuple):
 def boxes(wanted: torch.Tensor, margin: int, align: int) -> list[Box]:
     """Boxes that together hold all of ``wanted`` with ``margin`` around it; they don't touch.
 
-    Regions of cells that touch get a box each; boxes that touch, or that one pass is cheaper for, become one.
+    Regions of cells that touch get a box each; boxes that touch, or that one pass is cheaper for, become one; boxes
+    that hold most of the picture become all of it.
 
     Args:
         wanted: bool [H, W].
@@ -118,7 +123,10 @@ def boxes(wanted: torch.Tensor, margin: int, align: int) -> list[Box]:
             for start, along, size in ((top, part.any(dim=1), height), (left, part.any(dim=0), width))
         ]
         found.append(Box(*sides[0], *sides[1]))
-    return sorted(_joined(found), key=lambda box: (box.left, box.top))
+    found, whole = _joined(found), Box(0, height, 0, width)
+    if sum(box.pixels for box in found) > _WHOLE * whole.pixels:
+        return [whole]
+    return sorted(found, key=lambda box: (box.left, box.top))
 
 
 def _joined(found: list[Box]) -> list[Box]:
