@@ -66,12 +66,31 @@ def test_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     last = runtime.devices()[-1].index
     before = runtime.current()
     assert cli.main(["demo"]) == 0
-    assert cli.main(["demo", "--out", "x", "--height", "8", "--width", "9", "--seed", "3", "--device", last]) == 0
+    assert (
+        cli.main(
+            [
+                "demo",
+                "--out",
+                "x",
+                "--height",
+                "8",
+                "--width",
+                "9",
+                "--seed",
+                "3",
+                "--quality",
+                "fast",
+                "--device",
+                last,
+            ]
+        )
+        == 0
+    )
     assert cli.main(["demo", "--model", "geometric"]) == 0
     usual, given, geometric = calls
-    assert usual == (Path("out"), 256, 832, 0, None, before.info.index)
-    assert given == (Path("x"), 8, 9, 3, None, last)
-    assert geometric[-2] == "geometric"
+    assert usual == (Path("out"), 256, 832, 0, None, "balanced", before.info.index)
+    assert given == (Path("x"), 8, 9, 3, None, "fast", last)
+    assert geometric[4] == "geometric"
     assert runtime.current() is before
 
 
