@@ -258,6 +258,17 @@ def load(path: Path) -> list[Results]:
         raise ValueError(f"{path}: a benchmark's file lacks or mistakes {error}") from error
 
 
+def check_positive(config: Any, *names: str) -> None:
+    """Refuse settings that are not above 0.
+
+    Raises:
+        ValueError: the message names the first.
+    """
+    for name in names:
+        if getattr(config, name) <= 0:
+            raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
+
+
 def settings(config: Any) -> dict[str, Any]:
     """The fields of a benchmark's dataclass as JSON has them; files and folders as text."""
     return dict(plain(dataclasses.asdict(config)))

@@ -137,9 +137,7 @@ def main(config: RooflineBench) -> None:
         ValueError: a size, radius or number of calls that is not positive.
         DeviceError: no such device.
     """
-    for name in ("height", "width", "channels", "calls"):
-        if getattr(config, name) <= 0:
-            raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
+    _results.check_positive(config, "height", "width", "channels", "calls")
     if not config.radii or min(config.radii) <= 0:
         raise ValueError(f"`radii` must be one or more positive numbers, got {config.radii}")
     console = _results.console(_WIDTH)

@@ -153,9 +153,7 @@ def main(config: NetworkBench) -> None:
         ValueError: a size or number that is not positive, or a model that isn't known.
         DeviceError: no such device.
     """
-    for name in ("height", "width", "runs", "threads", "batch"):
-        if getattr(config, name) <= 0:
-            raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
+    _results.check_positive(config, "height", "width", "runs", "threads", "batch")
     model_config = configuration(config.model)
     console = _results.console()
     with runtime.use(config.device) as session, _timing.torch_threads(config.threads):

@@ -123,9 +123,7 @@ def main(config: OperatorsBench) -> None:
         ValueError: a size or time that is not positive.
         DeviceError: no such device.
     """
-    for name in ("height", "width", "channels", "radius", "seconds", "threads"):
-        if getattr(config, name) <= 0:
-            raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
+    _results.check_positive(config, "height", "width", "channels", "radius", "seconds", "threads")
     console = _results.console()
     with trace.record(config.trace), _timing.torch_threads(config.threads):
         results = _results.measure_each(config.device, partial(_measure_device, config, console), console)

@@ -94,9 +94,7 @@ def load(config: PipelineBench) -> Forecaster:
 
 
 def _check(config: PipelineBench) -> None:
-    for name in ("height", "width", "seconds", "threads"):
-        if getattr(config, name) <= 0:
-            raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
+    _results.check_positive(config, "height", "width", "seconds", "threads")
     for name in ("height", "width"):
         if getattr(config, name) % _dmvfn.MULTIPLE:
             raise ValueError(f"`{name}` must be a multiple of {_dmvfn.MULTIPLE} px, got {getattr(config, name)}")

@@ -90,9 +90,7 @@ def main(config: SplatBench) -> None:
 
 
 def _check(config: SplatBench) -> None:
-    for name in ("height", "width", "seconds", "threads"):
-        if getattr(config, name) <= 0:
-            raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
+    _results.check_positive(config, "height", "width", "seconds", "threads")
     if not config.radii or min(config.radii) <= 0:
         raise ValueError(f"`radii` must be one or more positive numbers, got {config.radii}")
 

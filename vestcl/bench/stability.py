@@ -139,8 +139,7 @@ def main(config: StabilityBench) -> int:
 
 
 def _chosen(config: StabilityBench) -> list[Family]:
-    if config.threads <= 0:
-        raise ValueError(f"`threads` must be positive, got {config.threads}")
+    _results.check_positive(config, "threads")
     known = {family.name: family for family in FAMILIES}
     for name in config.families:
         if name not in known:

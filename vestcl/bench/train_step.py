@@ -68,9 +68,7 @@ def main(config: TrainStepBench) -> None:
         ValueError: a size, number or time that is not positive, or a model that isn't known.
         DeviceError: no such device.
     """
-    for name in ("height", "width", "batch", "seconds", "threads"):
-        if getattr(config, name) <= 0:
-            raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
+    _results.check_positive(config, "height", "width", "batch", "seconds", "threads")
     model_config = configuration(config.model)
     console = _results.console()
     with trace.record(config.trace), _timing.torch_threads(config.threads):

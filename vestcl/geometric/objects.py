@@ -119,12 +119,19 @@ def velocities(
         here = believed & (things == thing)
         if here.sum() < _SMALLEST / 2 * things.size:
             continue
-        y, x = (indices[:: -(-len(indices) // _PIXELS)] for indices in np.nonzero(here))
-        rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(K).T
-        points = rays * depth[0, y, x, None]
+        y, x, points = some_points(here, _PIXELS, depth, K)
         measured = np.column_stack([moved[:, y, x].T, inverse_prev[y, x]])
         result[thing] = _velocity(points, measured, inverse_std, prev_from_cur, K)
     return result
+
+
+def some_points(
+    here: NDArray[np.bool_], most: int, depth: NDArray[np.float32], K: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Rows and columns of at most so many pixels of ``here`` [H, W], evenly chosen, and what they show, [N, 3] m."""
+    y, x = (indices[:: -(-len(indices) // most)] for indices in np.nonzero(here))
+    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(K).T
+    return y, x, rays * depth[0, y, x, None]
 
 
 def follow_flow(

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.geometric.objects import some_points
 from vestcl.scene import _check
 from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import sample
@@ -94,14 +95,13 @@ def search(things: NDArray[np.int32], by_flow: Array, depth: NDArray[np.float32]
     Returns:
         Row 0 is 0, as are things that stand, and all that are too small to tell.
     """
-    found, inverse = np.zeros_like(by_flow), np.linalg.inv(pair.K)
+    found = np.zeros_like(by_flow)
     valid = (things > 0) & (depth[0] > 0)
     for thing in range(1, len(found)):
-        y, x = np.nonzero(valid & (things == thing))
-        if len(x) < _FEWEST:
+        here = valid & (things == thing)
+        if here.sum() < _FEWEST:
             continue
-        y, x = (where[:: -(-len(where) // _COMPARED)] for where in (y, x))
-        points = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ inverse.T * depth[0, y, x, None]
+        y, x, points = some_points(here, _COMPARED, depth, pair.K)
         found[thing] = _search(points, pair.image[:, y, x], by_flow[thing], pair)
     return found
 

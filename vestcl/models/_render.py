@@ -139,13 +139,14 @@ def splat_cloud(
     if deep is not None:
         opacities = opacities * (~cloud.inpainted | _found(points_uv.detach(), starts, deep))
     if open_ is not None and tally is not None:
-        kept = torch.arange(len(z))
+        count = len(z)
         if open_.float().mean() <= _OPEN:
             kept = _reaching(points_uv.detach(), starts, open_)
             starts = torch.searchsorted(kept, starts)
             cloud = cloud.picked(kept, starts)
             points_uv, order, near, radii, opacities = (t[kept] for t in (points_uv, order, near, radii, opacities))
-        tally.add("covered", len(z) - len(kept), len(z), "points")
+            count = len(kept)
+        tally.add("covered", len(z) - count, len(z), "points")
     raster = rasterize(points_uv, order, radii, opacities, height, width, cloud_starts=starts)
     with torch.no_grad():
         known = cloud.background, last_motion(cloud, next_from_cur) / near[:, None]
