@@ -26,6 +26,7 @@ from vestcl.data import Street, intrinsics
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.splat import composite, rasterize
+from vestcl.ops.stretch import stretch
 from vestcl.ops.unproject import unproject
 
 HEIGHT, WIDTH = 20, 37
@@ -55,6 +56,7 @@ def small_operators(dtype: torch.dtype) -> None:
     for camera in (None, torch.eye(4, dtype=dtype).repeat(2, 1, 1)):
         points_uv, z = displace(points_xyz, flow, K, camera)
     backward(points_uv, z)
+    stretch(points_uv.detach().view(2, HEIGHT, WIDTH, 2), torch.rand(2, HEIGHT, WIDTH, dtype=dtype))
 
 
 def geometry(count: int, dtype: torch.dtype, radius: float) -> dict[str, Any]:

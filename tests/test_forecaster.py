@@ -56,7 +56,7 @@ def test_what_refinement_sees(name: str) -> None:
     assert len(sides) == (1 if render.joint else 2)
     wanted = []
     for side in sides:
-        planes = list(side[: 4 if render.colour else 1])
+        planes = [side.features] + [side.colour, side.coverage, side.inverse_depth] * render.colour
         if render.normalised:
             per = side.coverage.clamp(min=LEAST_COVERAGE)
             planes = [plane if plane is side.coverage else plane / per for plane in planes]
@@ -110,11 +110,9 @@ def test_the_radius_has_a_gradient() -> None:
     """A point on the optical axis: coming nearer changes nothing but its size, and so what it covers."""
     points, one = torch.tensor([[0.0, 0.0, 10.0]]), torch.ones(1, 1)
     displacement = torch.tensor([[0.0, 0.0, -2.0]], requires_grad=True)
-    seen, beside = torch.zeros(1, dtype=torch.bool), torch.zeros(1, 4, dtype=torch.int64)
-    starts = torch.tensor([0, 1])
-    cloud = Cloud(
-        points, displacement, torch.zeros(1, 3), torch.tensor([10.0]), torch.ones(1, 4), one, seen, beside, starts
-    )
+    seen, starts = torch.zeros(1, dtype=torch.bool), torch.tensor([0, 1])
+    size, white = torch.tensor([10.0]), torch.ones(1, 3)
+    cloud = Cloud(points, displacement, torch.zeros(1, 3), size, one, white, one, seen, (), starts)
     still, K = torch.eye(4)[None], camera(1, 9, 9)
     splat_cloud(cloud, Camera(still, K), K, still, RenderConfig(rho=1.5), 9, 9).coverage.sum().backward()
     assert displacement.grad is not None
@@ -237,9 +235,9 @@ def test_what_is_seen_is_never_hidden_by_what_is_inpainted() -> None:
     """A car drives away from the road that was painted 1 % behind it: it stays in front unless depth alone rules."""
     red, green = torch.tensor([[1.0, 0, 0, 1.0]]), torch.tensor([[0, 1.0, 0, 1.0]])
     xyz, moved = torch.tensor([[0, 0, 10.0], [0, 0, 10.1]]), torch.tensor([[0, 0, 2.0], [0, 0, 0]])
-    one, alone = torch.ones(2, 1), torch.arange(2)[:, None].expand(2, 4)
-    inpainted, starts = torch.tensor([False, True]), torch.tensor([0, 2])
-    cloud = Cloud(xyz, moved, 0 * moved, xyz[:, 2], torch.cat([red, green]), one, inpainted, alone, starts)
+    features, colour = torch.cat([red, green]).split([1, 3], dim=1)
+    one, inpainted, starts = torch.ones(2, 1), torch.tensor([False, True]), torch.tensor([0, 2])
+    cloud = Cloud(xyz, moved, 0 * moved, xyz[:, 2], features, colour, one, inpainted, (), starts)
     still, K = torch.eye(4)[None], camera(1, 9, 9)
     for rule, wanted in (("last", red), ("own", green)):
         config = RenderConfig(rho=1.5, inpainted=rule)  # type: ignore[arg-type]

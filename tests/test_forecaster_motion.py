@@ -115,9 +115,9 @@ def test_a_view_of_two_sides_by_hand() -> None:
     """The current frame covers half, the previous one is behind it."""
 
     def side(cover: float, colour: float, depth: float, background: float, motion: float) -> Side:
-        values = (0.0, colour * cover, cover, cover / depth, background * cover, motion / depth * cover)
-        counts = (4, 3, 1, 1, 1, 3)
-        return Side(*(torch.full((1, count, 1, 1), value) for count, value in zip(counts, values, strict=True)))
+        known = [colour] * 3 + [1 / depth, background] + [motion / depth] * 3
+        whole = torch.full((1, 1, 1, 1), cover)
+        return Side(torch.zeros(1, 4, 1, 1), cover * torch.tensor(known)[None, :, None, None], whole)
 
     image = torch.rand(1, 3, 1, 1)
     view = compose_view([side(0.8, 1.0, 4.0, 1.0, 2.0), side(0.5, 0.0, 2.0, 0.0, 1.0)], image)

@@ -134,10 +134,8 @@ def test_what_moves_keeps_its_velocity_in_the_world() -> None:
 
     own = at(1) - geometry.transform_points(motions[0], points)
     ones = torch.ones(10, 1).double()
-    itself, starts = torch.arange(10)[:, None].expand(10, 4), torch.tensor([0, 5, 10])
-    cloud = Cloud(
-        packed(points), packed(at(1) - points), packed(own), ones[:, 0], ones, ones, ones[:, 0] < 0, itself, starts
-    )
+    moved, seen, starts = (packed(at(1) - points), packed(own)), ones[:, 0] < 0, torch.tensor([0, 5, 10])
+    cloud = Cloud(packed(points), *moved, ones[:, 0], ones, ones.expand(-1, 3), ones, seen, (), starts)
     for k in range(2, 5):
         cloud = advance(cloud, motions[k - 1])
         assert torch.allclose(cloud.points_xyz, packed(at(k - 1)))

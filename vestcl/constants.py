@@ -10,6 +10,9 @@ NEAR: Final = 0.1
 #: clamp) then touches at most 2 x 2 tiles, and 16 x 16 x 32 float32 accumulators fit a 48 KiB L1 cache.
 TILE: Final = 16
 
+#: Pixels that were next to each other belong to one surface if a view shows them no farther apart than that, times
+#: what it magnifies: less tears surfaces that turn towards the camera, more draws skins between things and background.
+TORN: Final = 2.5
 
 #: Fragments whose alpha and transmittance the CPU backward keeps at a time, per tile. At least one
 #: point's largest footprint (TILE * TILE); 4096 keeps them in L1/L2 and a street tile in one segment.

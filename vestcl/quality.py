@@ -1,9 +1,9 @@
 """How good a forecast by a network has to be: three points on the curve of run time against error.
 
     exact      float32; skips what changes nothing but rounding
-    balanced   the knees that cost at most 0.1 dB of PSNR: what was measured to stand stands, details are refined at
-               half the size
-    fast       beyond them: details at a quarter of it, objects' motion by one block
+    balanced   the knees that cost at most 0.1 dB of PSNR: what was measured to stand stands, two blocks correct the
+               motion of what does not, details are refined at half the size
+    fast       beyond them: details at a quarter of it, things move as they were measured to
 
 `vestcl bench pareto` measures the curve; docs/time_against_error has it, and the points chosen.
 """
@@ -45,9 +45,11 @@ class Settings(NamedTuple):
 
 _SETTINGS: Final[dict[Quality, Settings]] = {
     "exact": Settings(Skip(), Effort(), None),
-    "balanced": Settings(Skip(margin=16, still=True), Effort(min_transmittance=0.01, paint_scale=0.5), "bfloat16"),
+    "balanced": Settings(
+        Skip(margin=16, still=True), Effort(min_transmittance=0.01, blocks=2, paint_scale=0.5), "bfloat16"
+    ),
     "fast": Settings(
-        Skip(margin=16, still=True), Effort(min_transmittance=0.03, blocks=1, paint_scale=0.25), "bfloat16"
+        Skip(margin=16, still=True), Effort(min_transmittance=0.03, blocks=0, paint_scale=0.25), "bfloat16"
     ),
 }
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vestcl
+from vestcl import constants
 from vestcl.forecast import Rendered
 
 #: A point's radius in pixels of the source, and its limits in the target: for colour shown directly 0.9 to 1.0 is
@@ -17,11 +18,10 @@ RADIUS_LIMITS: Final = (0.5, 8.0)
 #: From this coverage on a pixel is opaque: only cracks between a surface's points let through what lies behind.
 _OPAQUE: Final = 0.5
 
-#: Pixels that were next to each other belong to one surface if the view shows them no farther apart than that, times
-#: what it magnifies; and a surface is where a pixel has so many of its eight neighbours, or two on a line: a pole of
-#: one pixel has one above and one below, no farther apart than `_LINE`. The rest is spray: pixels at edges whose depth
-#: lies between that of the near and the far side.
-_TORN, _NEIGHBOURS, _LINE = 2.5, 3, 1.1
+#: A surface is where a pixel has so many of its eight neighbours no farther than `constants.TORN` away, or two on a
+#: line: a pole of one pixel has one above and one below, no farther apart than `_LINE`. The rest is spray: pixels at
+#: edges whose depth lies between that of the near and the far side.
+_NEIGHBOURS, _LINE = 3, 1.1
 
 #: Less coverage than that is a hole.
 _HOLE: Final = 0.05
@@ -116,12 +116,12 @@ def _surface(
         for down, right in steps
     ]
     limit = np.square(np.maximum(zoom, np.float32(1)))
-    count = (np.stack(beside) < _TORN**2 * limit).sum(0)
+    count = (np.stack(beside) < constants.TORN**2 * limit).sum(0)
     line = np.stack([np.maximum(one, other) for one, other in zip(beside[:4], beside[:3:-1], strict=True)])
     whole = (count >= _NEIGHBOURS) | (line < _LINE**2 * limit).any(0)
     above, left, right, below = (beside[steps.index(step)] for step in ((-1, 0), (0, -1), (0, 1), (1, 0)))
     spacing = np.stack([np.fmin(above, below), np.fmin(left, right)])
-    spacing = np.where(spacing < _TORN**2 * limit, spacing, 0).max(0)
+    spacing = np.where(spacing < constants.TORN**2 * limit, spacing, 0).max(0)
     return whole, np.maximum(zoom, np.sqrt(spacing)).astype(np.float32)
 
 

@@ -11,7 +11,6 @@ from torch.nn import functional
 
 from vestcl import geometry
 from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
-from vestcl.models._layers import side_by_side
 from vestcl.models.ego_motion import RigidMotion
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
@@ -36,8 +35,10 @@ class Cloud(NamedTuple):
     """[P, 3] m: what moved beside the camera over one frame interval, in the camera of t+k."""
     depth: torch.Tensor
     """[P] m, of the frame that they come from, and so the size of what a point stands for."""
-    shown: torch.Tensor
-    """[P, C + 3]: features and colour."""
+    features: torch.Tensor
+    """[P, C]."""
+    colour: torch.Tensor
+    """[P, 3]."""
     background: torch.Tensor
     """[P, 1]: 1 on the static background."""
     inpainted: torch.Tensor
@@ -66,32 +67,35 @@ def as_image(points: torch.Tensor, height: int, width: int) -> torch.Tensor:
     return points.unflatten(1, (height, width)).permute(0, 3, 1, 2)
 
 
-def lift(frame: EncodedFrame, flow: torch.Tensor, flow0: torch.Tensor, intervals: int, K: torch.Tensor) -> Cloud:
+def lift(
+    frame: EncodedFrame, points_xyz: torch.Tensor, flow: torch.Tensor, flow0: torch.Tensor, intervals: int
+) -> Cloud:
     """What a frame shows: each pixel.
 
     Args:
         frame: B of them.
+        points_xyz: [B, H W, 3] m, of its pixels.
         flow: [B, 3, H, W] m, that pixels follow.
         flow0: the same without what objects do.
         intervals: of frames that both span.
-        K: [B, 3, 3] px.
 
     Returns:
-        The cloud with H W points an image; differentiable in all but ``K``.
+        The cloud with H W points an image; differentiable.
     """
     layers = frame.layers
     batch, _, height, width = layers.image.shape
     starts = torch.arange(batch + 1) * (height * width)
 
-    def points(*images: torch.Tensor) -> torch.Tensor:
-        return as_points(side_by_side(images)).flatten(0, 1)
+    def points(image: torch.Tensor) -> torch.Tensor:
+        return as_points(image).flatten(0, 1)
 
     return Cloud(
-        unproject(layers.depth, K).flatten(0, 1),
+        points_xyz.flatten(0, 1),
         points(flow),
         points((flow - flow0) / intervals),
         layers.depth.flatten(),
-        points(frame.features, layers.image),
+        points(frame.features),
+        points(layers.image),
         layers.mask.reshape(-1, 1),
         torch.zeros(batch * height * width, dtype=torch.bool),
         tuple(Grid(start, height, width) for start in starts[:-1].tolist()),
@@ -111,24 +115,26 @@ def lift_hidden(frame: EncodedFrame, to_next: RigidMotion, K: torch.Tensor) -> C
         The cloud with |M = 0| points an image; differentiable in all but ``K``.
     """
     layers = frame.layers
-    hidden = (layers.mask < FOREGROUND_BELOW).flatten()
-    where = hidden.nonzero()[:, 0]
-    points = unproject(layers.background_depth, K)
-    shown = side_by_side([frame.background_features, layers.background_image])
+    hidden = (layers.mask < FOREGROUND_BELOW).flatten(1)
+    where, sizes = hidden.flatten().nonzero()[:, 0], hidden.sum(dim=1)
 
     def pick(points: torch.Tensor) -> torch.Tensor:
         return points.flatten(0, 1).index_select(0, where)
 
+    points = pick(unproject(layers.background_depth, K))
+    each = zip(points.split(sizes.tolist()), *to_next, strict=True)
+    flows = [rigid_flow(own[None], quaternion[None], translation[None])[0] for own, quaternion, translation in each]
     return Cloud(
-        pick(points),
-        pick(rigid_flow(points, *to_next)),
+        points,
+        torch.cat(flows),
         points.new_zeros(len(where), 3),
         layers.background_depth.flatten()[where],
-        pick(as_points(shown)),
+        pick(as_points(frame.background_features)),
+        pick(as_points(layers.background_image)),
         points.new_ones(len(where), 1),
         torch.ones(len(where), dtype=torch.bool),
         (),
-        functional.pad(hidden.view(len(layers.mask), -1).sum(dim=1).cumsum(0), (1, 0)),
+        functional.pad(sizes.cumsum(0), (1, 0)),
     )
 
 

@@ -3,6 +3,7 @@
 from collections import deque
 
 import torch
+from torch import nn
 from torch.nn import functional
 
 from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
@@ -40,9 +41,9 @@ class Memory:
         self._frames.append((key, layers, encoded))
 
 
-def version(encoder: Encoder) -> tuple[int, ...] | None:
+def version(*networks: nn.Module | None) -> tuple[int, ...] | None:
     """Differs after every change of the weights; None where that can't be told."""
-    parameters = list(encoder.parameters())
+    parameters = [parameter for network in networks if network is not None for parameter in network.parameters()]
     return None if any(p.is_inference() for p in parameters) else tuple(p._version for p in parameters)
 
 

@@ -24,6 +24,8 @@ class EncodedFrame(NamedTuple):
     """[B, C, ceil(H / 4), ceil(W / 4)], of the background: the encoder's own grid."""
     same: bool
     """Whether the backgrounds are the frames themselves."""
+    camera_grid: torch.Tensor | None = None
+    """What ego-motion forecasting sees in the background, `EgoMotion.look`; None where the model has no EMF."""
 
     @property
     def background_features(self) -> torch.Tensor:
@@ -46,8 +48,10 @@ def check_frames(frame_prev: LayerBatch, frame_cur: LayerBatch, K: torch.Tensor)
     }
     check(**tensors, K=(K, "B 3 3"))
     for name, (tensor, _) in tensors.items():
-        if name.endswith("depth") and not (tensor.isfinite() & (tensor > 0)).all():
-            raise ValueError(f"`{name}` must be finite and above 0 m, got {tensor.min()} to {tensor.max()}")
+        if name.endswith("depth"):
+            least, most = tensor.aminmax()  # both are NaN where one is
+            if not 0 < least <= most < torch.inf:
+                raise ValueError(f"`{name}` must be finite and above 0 m, got {least} to {most}")
 
 
 def with_depth(layers: LayerBatch, metres: float | None) -> LayerBatch:

@@ -114,8 +114,12 @@ def frame_pair(
         depth_prev=(depth_prev, one), depth_cur=(depth_cur, one),
         mask_prev=(mask_prev, one), mask_cur=(mask_cur, one),
     )  # fmt: skip
-    log_prev, log_cur = (depth.clamp(LOG_DEPTH_NEAR, LOG_DEPTH_FAR).log() for depth in (depth_prev, depth_cur))
-    return side_by_side([features_prev, log_prev, mask_prev]), side_by_side([features_cur, log_cur, mask_cur])
+    return frame_planes(features_prev, depth_prev, mask_prev), frame_planes(features_cur, depth_cur, mask_cur)
+
+
+def frame_planes(features: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """[F, log(clamp(D)), M] of a frame, [B, channels + 2, H, W]; arguments as of `frame_pair`, not checked."""
+    return side_by_side([features, depth.clamp(LOG_DEPTH_NEAR, LOG_DEPTH_FAR).log(), mask])
 
 
 def tensors_in(value: Any) -> Iterator[torch.Tensor]:

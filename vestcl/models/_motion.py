@@ -25,6 +25,8 @@ class Motion(NamedTuple):
     next_from_cur: RigidMotion
     later: tuple[RigidMotion, ...]
     """The camera's, of the intervals after t + 1, as far as they were forecast in one go."""
+    points: tuple[torch.Tensor, torch.Tensor]
+    """[B, H W, 3] m, the previous frame's pixels and the current one's, each in its own camera."""
     flow0: torch.Tensor
     """[B, 6, H, W] m: the rigid flow of the previous frame's pixels, then of the current one's."""
     start: torch.Tensor
@@ -84,7 +86,8 @@ def arrived(prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, to_next: Mot
     else:
         cur_from_prev = to_next.next_from_cur.inverse().after(to_next.next_from_prev)
     height, width = cur.features.shape[2:]
-    of_prev = as_image(rigid_flow(unproject(prev.layers.depth, K), *cur_from_prev), height, width)
+    points = unproject(prev.layers.depth, K), unproject(cur.layers.depth, K)
+    of_prev = as_image(rigid_flow(points[0], *cur_from_prev), height, width)
     flow0 = torch.cat([of_prev, torch.zeros_like(of_prev)], dim=1)
     flow = flow0
     if isinstance(to_next, MotionPrior):
@@ -92,4 +95,4 @@ def arrived(prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, to_next: Mot
         beside = torch.einsum("bij,bjhw->bihw", turn, to_next.velocity_prev)
         flow = flow0 + torch.cat([beside, torch.zeros_like(beside)], dim=1)
     objects = ObjectMotionForecast(flow, [], torch.zeros(len(flow), 0, dtype=torch.bool), None)
-    return Motion(cur_from_prev, RigidMotion.rest(cur.features), (), flow0, flow, objects)
+    return Motion(cur_from_prev, RigidMotion.rest(cur.features), (), points, flow0, flow, objects)

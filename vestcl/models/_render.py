@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 import torch
-from torch.nn import functional
 
 from vestcl import constants
 from vestcl.models._clouds import Cloud, Grid, last_motion
@@ -14,20 +14,20 @@ from vestcl.models.config import LEAST_COVERAGE, RenderConfig
 from vestcl.models.skipping import Tally
 from vestcl.ops.displace import displace
 from vestcl.ops.splat import composite, rasterize
+from vestcl.ops.stretch import stretch
 from vestcl.scene.holes import deep_holes
 from vestcl.scene.layers import SKY_DEPTH
-
-#: Pixels that were next to each other belong to one surface if the view shows them no farther apart than that, times
-#: what it magnifies (as in vestcl/geometric/render.py).
-_TORN: Final = 2.5
 
 #: Metres that inpainted points go farther back in the splatter's order, where they come last: what a frame has not seen
 #: never hides what it has. An inpainted point stands still 1 % behind the object that hides it, and a car that drives
 #: ahead of us would soon be behind the road that it was painted over.
 _BEHIND: Final = 4 * SKY_DEPTH
 
-#: Points are picked for open pixels where no more of a view is open than that: picking takes time, too.
-_OPEN: Final = 0.15
+#: Points are picked for open pixels where no more of them are left than that: picking takes time, too.
+_WORTH: Final = 0.7
+
+#: From a pixel's centre to its corner, and a little, px.
+_INSIDE: Final = 0.75
 
 #: Limits of a footprint's radius, px: half the splatter's tile, and where a footprint can miss every pixel centre.
 RADIUS: Final = (0.5, constants.TILE / 2)
@@ -47,17 +47,31 @@ class Side(NamedTuple):
 
     features: torch.Tensor
     """[B, C, H, W]."""
-    colour: torch.Tensor
-    """[B, 3, H, W]."""
+    known: torch.Tensor
+    """[B, 8, H, W]: what a view tells beside its features; the properties are its parts."""
     coverage: torch.Tensor
     """[B, 1, H, W]."""
-    inverse_depth: torch.Tensor
-    """[B, 1, H, W] 1/m, in the view's camera."""
-    background: torch.Tensor
-    """[B, 1, H, W], the share of static background; no gradient."""
-    inverse_motion: torch.Tensor
-    """[B, 3, H, W], (x_(t+k) - x_(t+k-1)) / z_tgt: else the sky, which turns by hundreds of metres, would outvote all
-    that it shines through; no gradient."""
+
+    @property
+    def colour(self) -> torch.Tensor:
+        """[B, 3, H, W]."""
+        return self.known[:, :3]
+
+    @property
+    def inverse_depth(self) -> torch.Tensor:
+        """[B, 1, H, W] 1/m, in the view's camera."""
+        return self.known[:, 3:4]
+
+    @property
+    def background(self) -> torch.Tensor:
+        """[B, 1, H, W], the share of static background."""
+        return self.known[:, 4:5]
+
+    @property
+    def inverse_motion(self) -> torch.Tensor:
+        """[B, 3, H, W], (x_(t+k) - x_(t+k-1)) / z_tgt: else the sky, which turns by hundreds of metres, would outvote
+        all that it shines through."""
+        return self.known[:, 5:]
 
 
 class RenderedView(NamedTuple):
@@ -117,7 +131,7 @@ def splat_cloud(
         width: columns of the view.
         min_transmittance: see `vestcl.splat`.
         open_: bool [B, 1, H, W], the pixels that count: others may be left empty. None is all.
-        tally: is told how many points that left out; None leaves out none.
+        tally: is told how many points reach none of them, and are left out; None leaves out none.
         deep: bool [B, 1, H, W], the pixels where inpainted points count, from `inner_holes`; None is all.
 
     Returns:
@@ -129,36 +143,29 @@ def splat_cloud(
     zoom_of_point = zoom.repeat_interleave(cloud.starts.diff())
     magnified, opacities = zoom_of_point * cloud.depth / near, torch.ones_like(z)
     if config.stretched:
-        stretch, opacities = _surface(points_uv.detach(), magnified.detach(), cloud.grids)
-        magnified = magnified * stretch
+        factor, opacities = _surface(points_uv.detach(), magnified.detach(), cloud.grids)
+        magnified = magnified * factor
     radii = (config.rho * magnified).clamp(*RADIUS)
     order = z.detach()
     if config.inpainted != "own":
         order = order + _BEHIND * cloud.inpainted
     starts = cloud.starts
     if deep is not None:
-        opacities = opacities * (~cloud.inpainted | _found(points_uv.detach(), starts, deep))
+        hidden = cloud.inpainted.nonzero()[:, 0]
+        opacities[hidden] *= _found(points_uv.detach()[hidden], torch.searchsorted(hidden, starts), deep)
     if open_ is not None and tally is not None:
-        count = len(z)
-        if open_.float().mean() <= _OPEN:
-            kept = _reaching(points_uv.detach(), starts, open_)
+        kept, worth = _reaching(points_uv.detach(), radii.detach(), opacities, starts, open_), _WORTH * len(z)
+        tally.add("covered", len(z) - len(kept) if len(kept) < worth else 0, len(z), "points")
+        if len(kept) < worth:
             starts = torch.searchsorted(kept, starts)
             cloud = cloud.picked(kept, starts)
             points_uv, order, near, radii, opacities = (t[kept] for t in (points_uv, order, near, radii, opacities))
-            count = len(kept)
-        tally.add("covered", len(z) - count, len(z), "points")
     raster = rasterize(points_uv, order, radii, opacities, height, width, cloud_starts=starts)
     with torch.no_grad():
-        known = cloud.background, last_motion(cloud, next_from_cur) / near[:, None]
-    shown = [cloud.shown, near.reciprocal()[:, None]]
-    separate = torch.is_grad_enabled()  # no gradient is to pass through what is known
-    image, coverage = composite(raster, torch.cat(shown if separate else [*shown, *known], 1), None, min_transmittance)
-    if separate:
-        with torch.no_grad():
-            more = composite(raster, torch.cat(known, 1), None, min_transmittance)[0]
-        image = torch.cat([image, more], dim=1)
-    features, colour, inverse_depth, background, inverse_motion = image.split([image.shape[1] - 8, 3, 1, 1, 3], dim=1)
-    return Side(features, colour, coverage, inverse_depth, background, inverse_motion)
+        measured = cloud.background, last_motion(cloud, next_from_cur) / near[:, None]
+    known = torch.cat([cloud.colour, near.reciprocal()[:, None], *measured], dim=1)
+    features, coverage = composite(raster, cloud.features, None, min_transmittance)
+    return Side(features, composite(raster, known, None, min_transmittance)[0], coverage)
 
 
 def inner_holes(hole: torch.Tensor) -> torch.Tensor:
@@ -169,62 +176,53 @@ def inner_holes(hole: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(np.stack([deep_holes(image) for image in hole.numpy()]))
 
 
-def _found(points_uv: torch.Tensor, starts: torch.Tensor, where: torch.Tensor, around: int = 0) -> torch.Tensor:
-    """bool [P]: which points [P, 2] px come to pixels of ``where`` [B, 1, H, W].
-
-    From up to ``around`` px outside, the nearest pixel counts; from farther away none is found.
-    """
+def _found(points_uv: torch.Tensor, starts: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
+    """bool [P]: which points [P, 2] px come to pixels of ``where`` [B, 1, H, W]."""
     height, width = where.shape[2:]
-    column, row = points_uv.nan_to_num(-1 - around).floor().long().unbind(1)
-    inside = (row >= -around) & (row < height + around) & (column >= -around) & (column < width + around)
-    image = torch.arange(len(where)).repeat_interleave(starts.diff())
-    place = (image * height + row.clamp(0, height - 1)) * width + column.clamp(0, width - 1)
-    return inside & where.flatten()[place]
+    inside = (points_uv >= 0).all(dim=1) & (points_uv < points_uv.new_tensor([width, height])).all(dim=1)
+    return inside & where.flatten()[_pixels_of(points_uv, starts, height, width)]
 
 
-def _reaching(points_uv: torch.Tensor, starts: torch.Tensor, open_: torch.Tensor) -> torch.Tensor:
-    """Indices of the points whose footprints may reach an open pixel, and some of their neighbours: of all that come to
-    a tile with one or beside it, which is farther than any radius.
+def _reaching(
+    points_uv: torch.Tensor, radii: torch.Tensor, opacities: torch.Tensor, starts: torch.Tensor, open_: torch.Tensor
+) -> torch.Tensor:
+    """Indices of the points that are not transparent and whose footprints may reach an open pixel.
+
+    From the picture's nearest pixel it is no farther to what is open than from a point outside; from a pixel's centre
+    to where in it a point lies are 0.71 px.
 
     Args:
         points_uv: [P, 2] px.
+        radii: [P] px.
+        opacities: [P].
         starts: [B + 1].
         open_: bool [B, 1, H, W].
     """
-    tiles = functional.max_pool2d(open_.to(points_uv), constants.TILE, ceil_mode=True)
-    wide = functional.max_pool2d(tiles, 3, stride=1, padding=1) > 0
-    return _found(points_uv / constants.TILE, starts, wide, around=1).nonzero()[:, 0]
+    closed = (~open_).to(torch.uint8).numpy()
+    far = np.stack([cv2.distanceTransform(image[0], cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for image in closed])
+    nearest = torch.from_numpy(far).flatten()[_pixels_of(points_uv, starts, *open_.shape[2:])]
+    return ((nearest <= radii + _INSIDE) & (opacities > 0)).nonzero()[:, 0]
+
+
+def _pixels_of(points_uv: torch.Tensor, starts: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """int32 [P]: index of the pixel of B H W that is nearest to each point [P, 2] px; 0 for what is no number."""
+    last = points_uv.new_tensor([width - 1, height - 1])
+    column, row = points_uv.nan_to_num(0).minimum(last).clamp_(min=0).to(torch.int32).unbind(1)
+    pixel = row * width + column
+    if len(starts) > 2:
+        pixel += torch.arange(len(starts) - 1, dtype=torch.int32).repeat_interleave(starts.diff()) * (height * width)
+    return pixel
 
 
 def _surface(
     points_uv: torch.Tensor, magnified: torch.Tensor, grids: Sequence[Grid]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """How much farther apart than ``magnified`` a surface's points are, and which points still are of a surface.
-
-    A surface that turns towards the camera is stretched by more than what it comes nearer by. Neighbours are together
-    up to _TORN times the magnification; of those at either side the nearer counts, of both directions the wider.
-
-    Args:
-        points_uv: [P, 2] px.
-        magnified: [P], size of a source pixel, px.
-        grids: `Cloud.grids`.
-
-    Returns:
-        Factor [P], 1 or more; opacity [P], 0 where a point had neighbours and none is near it any more.
-    """
+    """`stretch` of each of ``grids`` among the points [P, 2] and [P]; 1 and 1 for others, which have no neighbours."""
     factor, opacity = torch.ones_like(magnified), torch.ones_like(magnified)
     for start, height, width in grids:
-        own, size = slice(start, start + height * width), (height, width)
-        uv, pixel = points_uv[own].unflatten(0, size), magnified[own].unflatten(0, size)
-        limit, spacing = _TORN * pixel.clamp(min=1), torch.zeros_like(pixel)
-        together = torch.full_like(pixel, height * width == 1, dtype=torch.bool)
-        for axis, (before, after) in enumerate((((0, 0, 1, 0), (0, 0, 0, 1)), ((1, 0), (0, 1)))):
-            gap = torch.linalg.vector_norm(uv.diff(dim=axis), dim=2).nan_to_num(nan=torch.inf, posinf=torch.inf)
-            nearer = torch.minimum(*(functional.pad(gap, side, value=torch.inf) for side in (before, after)))
-            near = nearer < limit
-            spacing, together = spacing.maximum(torch.where(near, nearer, 0)), together | near
-        factor[own] = (spacing / pixel.clamp(min=1e-6)).clamp(min=1).flatten()
-        opacity[own] = together.flatten().to(opacity)
+        own, size = slice(start, start + height * width), (1, height, width)
+        found = stretch(points_uv[own].unflatten(0, size), magnified[own].unflatten(0, size))
+        factor[own], opacity[own] = (plane.flatten() for plane in found)
     return factor, opacity
 
 
@@ -233,11 +231,21 @@ def refined_channels(side: Side, colour: bool, normalised: bool) -> torch.Tensor
 
     ``normalised`` divides all but coverage by it, or by LEAST_COVERAGE where there is less.
     """
-    per_coverage = 1 / side.coverage.clamp(min=LEAST_COVERAGE) if normalised else 1
+    per_coverage = _per_coverage(side) if normalised else 1
     planes = [side.features * per_coverage]
     if colour:
-        planes += [side.colour * per_coverage, side.coverage, side.inverse_depth * per_coverage]
+        looks = side.known[:, :4] * per_coverage
+        planes += [looks[:, :3], side.coverage, looks[:, 3:]]
     return side_by_side(planes)
+
+
+def looks_of(side: Side, normalised: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Colour [B, 3, H, W] as in `refined_channels`, and coverage [B, 1, H, W]."""
+    return side.colour * (_per_coverage(side) if normalised else 1), side.coverage
+
+
+def _per_coverage(side: Side) -> torch.Tensor:
+    return 1 / side.coverage.clamp(min=LEAST_COVERAGE)
 
 
 def compose_view(sides: Sequence[Side], image: torch.Tensor) -> RenderedView:
@@ -250,15 +258,16 @@ def compose_view(sides: Sequence[Side], image: torch.Tensor) -> RenderedView:
     Returns:
         The view; differentiable in colour, coverage, depth and image.
     """
-    behind, *fronts = (side_by_side(side[1:]) for side in sides)
-    for front in fronts:
-        behind = front + (1 - front[:, 3:4]) * behind
-    colour, coverage, inverse_depth, background, inverse_motion = behind.split([3, 1, 1, 1, 3], dim=1)
-    known = coverage >= LEAST_COVERAGE
-    inverse_depth = torch.where(known, inverse_depth, 1)
-    depth = torch.where(known, coverage, 0) / inverse_depth
-    background = torch.where(known, background / coverage.detach().clamp(min=LEAST_COVERAGE), 1).detach()
-    motion_xyz = torch.where(known, inverse_motion / inverse_depth, 0).detach()
+    known, coverage = sides[0][1:]
+    for front in sides[1:]:
+        through = 1 - front.coverage
+        known, coverage = front.known + through * known, front.coverage + through * coverage
+    colour, inverse_depth, background, inverse_motion = known.split([3, 1, 1, 3], dim=1)
+    seen = coverage >= LEAST_COVERAGE
+    inverse_depth = torch.where(seen, inverse_depth, 1)
+    depth = torch.where(seen, coverage, 0) / inverse_depth
+    background = torch.where(seen, background / coverage.detach().clamp(min=LEAST_COVERAGE), 1).detach()
+    motion_xyz = torch.where(seen, inverse_motion / inverse_depth, 0).detach()
     return RenderedView(image, colour, coverage, depth, background, motion_xyz)
 
 

@@ -1,5 +1,6 @@
 """The networks and the stages of a forecast, from left to right as in the paper's figure."""
 
+import itertools
 from collections.abc import Sequence
 
 import torch
@@ -12,13 +13,22 @@ from vestcl.models._frames import EncodedFrame, grid_depth, grid_mean, with_dept
 from vestcl.models._layers import side_by_side
 from vestcl.models._motion import INTERVALS, Motion
 from vestcl.models._objects import move_objects, unmoved
-from vestcl.models._render import Camera, RenderedView, Side, compose_view, inner_holes, refined_channels, splat_cloud
+from vestcl.models._render import (
+    Camera,
+    RenderedView,
+    Side,
+    compose_view,
+    inner_holes,
+    looks_of,
+    refined_channels,
+    splat_cloud,
+)
 from vestcl.models.config import OPAQUE, ModelConfig
 from vestcl.models.effort import Effort, enlarged, fraction, reduced
 from vestcl.models.ego_motion import CameraMotion, EgoMotion, RigidMotion
 from vestcl.models.encoder import Encoder
 from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
-from vestcl.models.prior import MotionPrior, beside
+from vestcl.models.prior import MotionPrior, beside, nothing_rolls
 from vestcl.models.refine import Refine
 from vestcl.models.skipping import Skip, Tally
 from vestcl.ops.rigid_flow import rigid_flow
@@ -51,8 +61,8 @@ class Stages(nn.Module):
         self.memory = Memory()
 
     def encode(self, frame: LayerBatch) -> EncodedFrame:
-        """Features of a frame and of its background, in one pass; backgrounds without foreground in front are the
-        frame itself.
+        """Features of a frame and of its background, in one pass, and what EMF sees in it; backgrounds without
+        foreground in front are the frame itself.
 
         Args:
             frame: layers of B frames.
@@ -69,6 +79,9 @@ class Stages(nn.Module):
             return known
         with self._autocast():
             encoded = encode(self.encoder, self.config.encoder, layers, self.skip, self.tally)
+        if self.ego_motion is not None:
+            depth, mask = grid_depth(layers.background_depth), grid_mean(layers.mask)
+            encoded = encoded._replace(camera_grid=self.ego_motion.look(encoded.background_grid, depth, mask))
         if key is not None:
             self.memory.keep(key, frame, encoded)
         return encoded
@@ -86,25 +99,20 @@ class Stages(nn.Module):
             `Motion`; differentiable.
         """
         to_next = self.move_camera(prev, cur, prior)
-        flows = [
-            rigid_flow(unproject(frame.layers.depth, K), *rigid)
-            for frame, rigid in zip((prev, cur), to_next[:2], strict=True)
-        ]
+        points = unproject(prev.layers.depth, K), unproject(cur.layers.depth, K)
+        flows = [rigid_flow(xyz, *rigid) for xyz, rigid in zip(points, to_next[:2], strict=True)]
         flow0 = as_image(torch.cat(flows, dim=2), *cur.features.shape[2:])
-        start = flow0 if prior is None or self.object_motion is None else flow0 + beside(prior, to_next[:2])
-        return Motion(*to_next, flow0, start, self.move_objects(prev, cur, to_next, flow0, start))
+        still = prior is None or self.object_motion is None or nothing_rolls(prior)
+        start = flow0 if still else flow0 + beside(prior, to_next[:2])
+        return Motion(*to_next, points, flow0, start, self.move_objects(prev, cur, to_next, flow0, start))
 
     def move_camera(self, prev: EncodedFrame, cur: EncodedFrame, prior: MotionPrior | None = None) -> CameraMotion:
         """EMF on the encoder's grid: the camera's motion; rest where the model has no EMF."""
-        if self.ego_motion is None:
+        if self.ego_motion is None or prev.camera_grid is None or cur.camera_grid is None:
             return CameraMotion(*2 * (RigidMotion.rest(cur.features),))
-        frames = prev, cur
-        return self.ego_motion(
-            *(frame.background_grid for frame in frames),
-            *(grid_depth(frame.layers.background_depth) for frame in frames),
-            *(grid_mean(frame.layers.mask) for frame in frames),
-            prior=None if prior is None else (prior.next_from_cur, prior.cur_from_prev, prior.prev_from_before),
-        )
+        masks = (grid_mean(frame.layers.mask) for frame in (prev, cur))
+        known = None if prior is None else (prior.next_from_cur, prior.cur_from_prev, prior.prev_from_before)
+        return self.ego_motion.decide(prev.camera_grid, cur.camera_grid, *masks, known)
 
     def move_objects(
         self,
@@ -135,7 +143,9 @@ class Stages(nn.Module):
         """
         rigid, render = (motion.next_from_prev, motion.next_from_cur), self.config.render
         flows, flows0 = motion.objects.flow.split(3, dim=1), motion.flow0.split(3, dim=1)
-        of_prev, of_cur = (lift(*arguments, K) for arguments in zip((prev, cur), flows, flows0, INTERVALS, strict=True))
+        of_prev, of_cur = itertools.starmap(
+            lift, zip((prev, cur), motion.points, flows, flows0, INTERVALS, strict=True)
+        )
         behind_cur = lift_hidden(cur, rigid[1], K)
         if render.inpainted != "own":
             clouds = [join(of_prev, behind_cur), of_cur]
@@ -168,23 +178,23 @@ class Stages(nn.Module):
         return [Side(*(enlarged(plane, height, width) for plane in side)) for side in sides]
 
     def paint(self, sides: Sequence[Side]) -> torch.Tensor:
-        """The refined image [B, 3, H, W], from the channels that `RenderConfig.channels` counts."""
-        render = self.config.render
-        planes = [refined_channels(side, render.colour, render.normalised) for side in sides]
-        with self._autocast():
-            return self._refined(side_by_side(planes)).to(planes[0].dtype)
+        """The refined image [B, 3, H, W], from the channels that `RenderConfig.channels` counts.
 
-    def _refined(self, rendered: torch.Tensor) -> torch.Tensor:
-        """The image; its difference to what refinement adds to is computed at `Effort.paint_scale`."""
-        height, width = rendered.shape[2:]
+        What refinement adds to its base is computed at `Effort.paint_scale`, from means over the sides' cells.
+        """
+        render = self.config.render
+        height, width = sides[0].coverage.shape[2:]
         size = fraction(height, width, self.effort.paint_scale)
-        if size == (height, width):
-            return self.refine(rendered)
-        if self.refine.base == "none":
+        if size != (height, width) and self.refine.base == "none":
             raise ValueError(f"`effort.paint_scale` must be 1 for {self.config.name}, which paints anew, got {size}")
-        small = reduced(rendered, *size)
-        added = self.refine(small) - self.refine.base_image(small)
-        image = self.refine.base_image(rendered) + enlarged(added, height, width)
+        seen = [Side(*(reduced(plane, *size) for plane in side)) for side in sides]
+        rendered = side_by_side([refined_channels(side, render.colour, render.normalised) for side in seen])
+        with self._autocast():
+            if size == (height, width):
+                return self.refine(rendered).to(rendered.dtype)
+            added = self.refine.painted(rendered).to(rendered.dtype)
+        base = self.refine.base_of([looks_of(side, render.normalised) for side in sides])
+        image = base + enlarged(added, height, width)
         return image if self.training else image.clamp(0, 1)
 
     def _splat(
@@ -202,7 +212,7 @@ class Stages(nn.Module):
 
     def _encoding(self) -> object:
         """What features depend on beside the frame; None where they are not remembered."""
-        known = version(self.encoder) if self.skip.seen else None
+        known = version(self.encoder, self.ego_motion) if self.skip.seen else None
         return known and (known, self.skip, self.autocast)
 
     def _autocast(self) -> torch.autocast:

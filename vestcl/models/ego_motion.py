@@ -1,13 +1,13 @@
 """Ego-motion forecasting (EMF): how the camera will have moved by the next frame, from two backgrounds."""
 
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
 import torch
 from torch import nn
 from torch.nn import functional
 
 from vestcl import geometry
-from vestcl.models._layers import frame_pair
+from vestcl.models._layers import frame_pair, frame_planes
 from vestcl.models.config import EgoMotionConfig
 
 #: (stride, dilation) of the four convolutions: the one reading of the paper's table that agrees with its sizes.
@@ -146,10 +146,38 @@ class EgoMotion(nn.Module):
         Raises:
             ValueError: an argument of another shape, or a prior missing or not asked for.
         """
+        pair = frame_pair(features_prev, features_cur, depth_prev, depth_cur, mask_prev, mask_cur, self.features)
+        return self.decide(*map(self.frame, pair), mask_prev, mask_cur, prior)
+
+    def look(self, features: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        """The first half of `forward`, which a frame goes through alone, and so once: its channels of the tokens.
+
+        Args:
+            features: [B, features, h, w] of the inpainted background.
+            depth: [B, 1, h, w] m of it.
+            mask: [B, 1, h, w], 1 where the frame itself shows static background.
+
+        Returns:
+            [B, channels, ceil(h / 4), ceil(w / 4)]; differentiable.
+        """
+        return cast(torch.Tensor, self.frame(frame_planes(features, depth, mask)))
+
+    def decide(
+        self,
+        grid_prev: torch.Tensor,
+        grid_cur: torch.Tensor,
+        mask_prev: torch.Tensor,
+        mask_cur: torch.Tensor,
+        prior: tuple[RigidMotion, RigidMotion, RigidMotion] | None,
+    ) -> CameraMotion:
+        """The second half of `forward`: the camera's motion from what `look` gives for both frames.
+
+        Raises:
+            ValueError: a prior missing or not asked for.
+        """
         if (prior is None) != (self.shown is None):
             raise ValueError(f"`prior` must be {'none' if self.shown is None else 'given'} with this `start`")
-        pair = frame_pair(features_prev, features_cur, depth_prev, depth_cur, mask_prev, mask_cur, self.features)
-        grid = torch.cat([self.frame(frame) for frame in pair], dim=1)
+        grid = torch.cat([grid_prev, grid_cur], dim=1)
         tokens = (grid + sinusoidal_positions(grid)).flatten(2).mT
         if prior is not None and self.shown is not None:
             measured = torch.cat([_numbers(motion) for motion in prior[1:]], dim=1)

@@ -1,5 +1,8 @@
 """Refinement: a U-Net that makes the image out of what the clouds left on the new view."""
 
+from collections.abc import Sequence
+from typing import cast
+
 import torch
 from torch import nn
 from torch.nn import functional
@@ -59,6 +62,14 @@ class Refine(nn.Module):
         Raises:
             ValueError: ``rendered`` is not floating point [B, channels, H, W].
         """
+        y = self.painted(rendered)
+        if self.base == "none":
+            return y.sigmoid()
+        image = self.base_image(rendered) + y
+        return image if self.training else image.clamp(0, 1)
+
+    def painted(self, rendered: torch.Tensor) -> torch.Tensor:
+        """y of the class's formula, [B, 3, H, W]; arguments and errors as of `forward`."""
         check(rendered=(rendered, f"B {self.channels} H W"))
         stem = self.stem(channels_last(rendered))
         levels = []
@@ -69,17 +80,18 @@ class Refine(nn.Module):
         levels.pop()
         for up in self.ups:
             x = up(x, *levels.pop())
-        y = self.out(side_by_side([stem, upsample(x, 2, *stem.shape[-2:])]))
-        if self.base == "none":
-            return y.sigmoid()
-        image = self.base_image(rendered) + y
-        return image if self.training else image.clamp(0, 1)
+        return cast(torch.Tensor, self.out(side_by_side([stem, upsample(x, 2, *stem.shape[-2:])])))
 
     def base_image(self, rendered: torch.Tensor) -> torch.Tensor:
-        """b of the class's formula, [B, 3, H, W]."""
-        image, opacity = torch.zeros_like(rendered[:, :3]), torch.zeros_like(rendered[:, :1])
-        for side in rendered.chunk(1 if self.render.joint else 2, dim=1):
-            colour, coverage = side[:, self.features :].split([3, 1, 1], dim=1)[:2]
+        """b of the class's formula, [B, 3, H, W], of what `forward` is given."""
+        sides = rendered.chunk(1 if self.render.joint else 2, dim=1)
+        looks = (side[:, self.features :].split([3, 1, 1], dim=1) for side in sides)
+        return self.base_of([(colour, coverage) for colour, coverage, _ in looks])
+
+    def base_of(self, sides: Sequence[tuple[torch.Tensor, torch.Tensor]]) -> torch.Tensor:
+        """b, [B, 3, H, W], of the sides' colour [B, 3, H, W] and coverage [B, 1, H, W], the last one in front."""
+        image, opacity = torch.zeros_like(sides[0][0]), torch.zeros_like(sides[0][1])
+        for colour, coverage in sides:
             if self.base == "filled":
                 coverage = ((coverage - LEAST_COVERAGE) / (OPAQUE - LEAST_COVERAGE)).clamp(0, 1)
                 colour = colour * coverage

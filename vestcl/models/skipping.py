@@ -24,9 +24,8 @@ class Skip:
     """The background is encoded around what foreground hides, and not at all where there is none."""
     objects: bool = True
     """Object motion is forecast around the foreground, and not at all where there is none."""
-    covered: bool = False
-    """Of the previous frame's points those are splatted that come to where the current frame leaves something open.
-    Off: to pick them takes as long as it saves (`vestcl bench pipeline`)."""
+    covered: bool = True
+    """Of the previous frame's points those are splatted that come to where the current frame leaves something open."""
     views: bool = True
     """A camera that is asked for twice is shown once."""
     margin: int | None = None

@@ -1,0 +1,48 @@
+"""What of a picture is still one surface in another view, and how far it is stretched there (kernels/stretch.cl)."""
+
+import numpy as np
+import torch
+
+from vestcl import constants, runtime
+from vestcl.ops._arguments import Array, as_array, check, work_items
+
+
+def stretch(points_uv: Array, magnified: Array) -> tuple[Array, Array]:
+    """How much farther apart than magnified a picture's points come to lie, and which are torn from all neighbours.
+
+        h = min(|uv - uv_left|, |uv - uv_right|),   v = min(|uv - uv_above|, |uv - uv_below|)
+        each counts where it is below TORN max(m, 1)
+        factor = max(1, max(h, v) / m),   opacity = 1 where h or v counts or the picture is one pixel, else 0
+
+    A surface that turns towards the camera is stretched by more than what it comes nearer by. Of the neighbours at
+    either side the nearer one counts, of both directions the wider gap.
+
+    Args:
+        points_uv: [B, H, W, 2] px, where the view shows the picture's pixels; a gap to what is not finite does not
+            count. Torch CPU tensor or NumPy array, float32 or float64.
+        magnified: m [B, H, W] px, the size that a pixel has in the view. Of the same kind and dtype.
+
+    Returns:
+        factor and opacity [B, H, W], of the kind and dtype that came in. They have no gradient.
+
+    Raises:
+        ValueError: an argument of another kind, dtype or shape.
+        DeviceError: no OpenCL device, or one without float64 where that is asked for.
+
+    Source: `constants.TORN`; Zwicker et al., Surface Splatting, SIGGRAPH 2001, has the footprint's general form.
+    """
+    check(points_uv=(points_uv, "B H W 2"), magnified=(magnified, "B H W"))
+    uv, m = as_array(points_uv), as_array(magnified)
+    batch, height, width = m.shape
+    factor, opacity = np.empty_like(m), np.empty_like(m)
+    session = runtime.current()
+    if m.size:
+        chunk, items, group = work_items(session, width)
+        sizes: list[runtime.Argument] = [np.int32(height), np.int32(width), chunk]
+        with session.job() as job:
+            arguments = [*sizes, *map(job.read, (uv, m)), *map(job.write, (factor, opacity))]
+            defines = runtime.defines_for(m.dtype, TORN=str(constants.TORN))
+            job.launch("stretch.cl", "stretch", defines, (items, height, batch), arguments, (group, 1, 1))
+    if isinstance(points_uv, torch.Tensor):
+        return torch.from_numpy(factor), torch.from_numpy(opacity)
+    return factor, opacity
