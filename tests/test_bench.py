@@ -158,9 +158,10 @@ def test_tasks_take_turns_without_garbage_collection() -> None:
         if len(ran) > 4:
             assert not gc.isenabled()
 
-    times = _timing.interleave({"a": lambda: task("a"), "b": lambda: task("b")}, seconds=0.0, least=3)
-    assert "".join(ran) == "ab" * (2 + 3)
-    assert {name: len(values) for name, values in times.items()} == {"a": 3, "b": 3}
+    times = _timing.interleave({"a": lambda: task("a"), "b": lambda: task("b")}, seconds=0.0, least=20)
+    rounds = ["".join(ran[start : start + 2]) for start in range(0, len(ran), 2)]
+    assert len(rounds) == 2 + 20 and set(rounds[2:]) == {"ab", "ba"}
+    assert {name: len(values) for name, values in times.items()} == {"a": 20, "b": 20}
     assert gc.isenabled()
 
 

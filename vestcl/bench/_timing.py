@@ -5,6 +5,7 @@ import ctypes
 import gc
 import os
 import platform
+import random
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -50,7 +51,9 @@ class Spread:
 
 
 def interleave(tasks: Mapping[str, Task], seconds: float, least: int = LEAST_ROUNDS) -> dict[str, NDArray[np.float64]]:
-    """Run ``tasks`` in turns, A B C A B C ..., without garbage collection; the seconds of every run.
+    """Run ``tasks`` in rounds, C A B, B A C, ..., without garbage collection; the seconds of every run.
+
+    Each round has an order of its own, the same in every call: what ran before leaves caches and memory to a task.
 
     Args:
         tasks: by name. Each runs twice before anything counts. Releasing what it returns is not timed.
@@ -60,12 +63,14 @@ def interleave(tasks: Mapping[str, Task], seconds: float, least: int = LEAST_ROU
     for task in (*tasks.values(), *tasks.values()):
         task()
     times: dict[str, list[float]] = {name: [] for name in tasks}
+    shuffle, order = random.Random(0).shuffle, list(tasks.items())
     end = time.perf_counter() + seconds
     with _no_collection():
         for number in range(MOST_ROUNDS):
             if number >= least and time.perf_counter() > end:
                 break
-            for name, task in tasks.items():
+            shuffle(order)
+            for name, task in order:
                 time.sleep(PAUSE)
                 start = time.perf_counter()
                 result = task()

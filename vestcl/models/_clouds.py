@@ -121,12 +121,11 @@ def lift_hidden(frame: EncodedFrame, to_next: RigidMotion, K: torch.Tensor) -> C
     def pick(points: torch.Tensor) -> torch.Tensor:
         return points.flatten(0, 1).index_select(0, where)
 
-    points = pick(unproject(layers.background_depth, K))
-    each = zip(points.split(sizes.tolist()), *to_next, strict=True)
-    flows = [rigid_flow(own[None], quaternion[None], translation[None])[0] for own, quaternion, translation in each]
+    depth = layers.background_depth if len(where) else layers.background_depth[:, :, :0]
+    points = pick(unproject(depth, K))
     return Cloud(
         points,
-        torch.cat(flows),
+        _flow_of(points, to_next, sizes.tolist()),
         points.new_zeros(len(where), 3),
         layers.background_depth.flatten()[where],
         pick(as_points(frame.background_features)),
@@ -173,8 +172,17 @@ def advance(cloud: Cloud, next_from_cur: torch.Tensor) -> Cloud:
 
 def last_motion(cloud: Cloud, next_from_cur: torch.Tensor) -> torch.Tensor:
     """x_k - x_(k-1) with x_(k-1) = G^-1 (x_k - s_k): for the previous frame's points, too, which came two intervals."""
-    points = cloud.points_xyz + cloud.displacement_xyz
-    return points - _per_image(points - cloud.step_xyz, geometry.invert(next_from_cur), cloud.sizes)
+    still = cloud.points_xyz + cloud.displacement_xyz - cloud.step_xyz
+    back = geometry.invert(next_from_cur)
+    motion = RigidMotion(geometry.matrix_to_quaternion(back[:, :3, :3]), back[:, :3, 3])
+    return cloud.step_xyz - _flow_of(still, motion, cloud.sizes)
+
+
+def _flow_of(points_xyz: torch.Tensor, rigid: RigidMotion, sizes: list[int]) -> torch.Tensor:
+    """Each image's points [P, 3] on their way by its own motion."""
+    each = zip(points_xyz.split(sizes), *rigid, strict=True)
+    flows = [rigid_flow(own[None], quaternion[None], translation[None])[0] for own, quaternion, translation in each]
+    return flows[0] if len(flows) == 1 else torch.cat(flows)
 
 
 def _per_image(points_xyz: torch.Tensor, dst_from_src: torch.Tensor, sizes: list[int]) -> torch.Tensor:

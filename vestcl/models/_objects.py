@@ -57,7 +57,7 @@ def move_objects(
     if blocks == 0:
         return unmoved(start)
     moving = torch.cat([frame.layers.mask < FOREGROUND_BELOW for frame in (prev, cur)], dim=1)
-    if skip.objects and skip.still and start is not flow0:
+    if skip.objects and skip.still and start is not flow0 and moving.any():
         moving &= _rolling(moving, start - flow0)
     found = _where(network, moving, skip, tally, blocks)
     if not found:
@@ -91,7 +91,7 @@ def _rolling(foreground: torch.Tensor, beside: torch.Tensor) -> torch.Tensor:
     """bool [B, 2, H, W]: where what is ``foreground`` [B, 2, H, W] moves by SLOWEST an interval or more beside the
     camera, ``beside`` [B, 6, H, W] m, in the mean over cells: some pixels of a parked car always seem to."""
     height, width = foreground.shape[2:]
-    metres = torch.linalg.vector_norm(beside.unflatten(1, (2, 3)), dim=2) / beside.new_tensor(INTERVALS)[:, None, None]
+    metres = beside.unflatten(1, (2, 3)).square().sum(dim=2).sqrt() / beside.new_tensor(INTERVALS)[:, None, None]
     share, moved = (
         functional.avg_pool2d(plane, _CELL, ceil_mode=True)
         for plane in (foreground.to(metres), torch.where(foreground, metres, 0))

@@ -28,7 +28,7 @@ from vestcl.models.effort import Effort, enlarged, fraction, reduced
 from vestcl.models.ego_motion import CameraMotion, EgoMotion, RigidMotion
 from vestcl.models.encoder import Encoder
 from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
-from vestcl.models.prior import MotionPrior, beside, nothing_rolls
+from vestcl.models.prior import MotionPrior, beside
 from vestcl.models.refine import Refine
 from vestcl.models.skipping import Skip, Tally
 from vestcl.ops.rigid_flow import rigid_flow
@@ -102,8 +102,7 @@ class Stages(nn.Module):
         points = unproject(prev.layers.depth, K), unproject(cur.layers.depth, K)
         flows = [rigid_flow(xyz, *rigid) for xyz, rigid in zip(points, to_next[:2], strict=True)]
         flow0 = as_image(torch.cat(flows, dim=2), *cur.features.shape[2:])
-        still = prior is None or self.object_motion is None or nothing_rolls(prior)
-        start = flow0 if still else flow0 + beside(prior, to_next[:2])
+        start = flow0 if prior is None or self.object_motion is None else flow0 + beside(prior, to_next[:2])
         return Motion(*to_next, points, flow0, start, self.move_objects(prev, cur, to_next, flow0, start))
 
     def move_camera(self, prev: EncodedFrame, cur: EncodedFrame, prior: MotionPrior | None = None) -> CameraMotion:

@@ -56,11 +56,6 @@ def check_prior(prior: MotionPrior, like: torch.Tensor) -> None:
     )
 
 
-def nothing_rolls(prior: MotionPrior) -> bool:
-    """Whether no pixel was measured to move in the world."""
-    return not (prior.velocity_prev.any() or prior.velocity_cur.any())
-
-
 def beside(prior: MotionPrior, to_next: Sequence[RigidMotion]) -> torch.Tensor:
     """n R v [B, 6, H, W] m: what the velocities v add to the rigid flow over n = 2 and n = 1 intervals."""
     moved = []

@@ -90,8 +90,12 @@ class Refine(nn.Module):
 
     def base_of(self, sides: Sequence[tuple[torch.Tensor, torch.Tensor]]) -> torch.Tensor:
         """b, [B, 3, H, W], of the sides' colour [B, 3, H, W] and coverage [B, 1, H, W], the last one in front."""
-        image, opacity = torch.zeros_like(sides[0][0]), torch.zeros_like(sides[0][1])
+        image, opacity = (
+            torch.zeros_like(sides[0][0], memory_format=torch.contiguous_format),
+            torch.zeros_like(sides[0][1]),
+        )
         for colour, coverage in sides:
+            colour = colour.contiguous()  # three planes are faster to fill than pixels of three
             if self.base == "filled":
                 coverage = ((coverage - LEAST_COVERAGE) / (OPAQUE - LEAST_COVERAGE)).clamp(0, 1)
                 colour = colour * coverage
