@@ -109,9 +109,9 @@ class Stages(nn.Module):
         """EMF on the encoder's grid: the camera's motion; rest where the model has no EMF."""
         if self.ego_motion is None or prev.camera_grid is None or cur.camera_grid is None:
             return CameraMotion(*2 * (RigidMotion.rest(cur.features),))
-        masks = (grid_mean(frame.layers.mask) for frame in (prev, cur))
+        mask_prev, mask_cur = (grid_mean(frame.layers.mask) for frame in (prev, cur))
         known = None if prior is None else (prior.next_from_cur, prior.cur_from_prev, prior.prev_from_before)
-        return self.ego_motion.decide(prev.camera_grid, cur.camera_grid, *masks, known)
+        return self.ego_motion.decide(prev.camera_grid, cur.camera_grid, mask_prev, mask_cur, known)
 
     def move_objects(
         self,

@@ -147,7 +147,7 @@ class EgoMotion(nn.Module):
             ValueError: an argument of another shape, or a prior missing or not asked for.
         """
         pair = frame_pair(features_prev, features_cur, depth_prev, depth_cur, mask_prev, mask_cur, self.features)
-        return self.decide(*map(self.frame, pair), mask_prev, mask_cur, prior)
+        return self.decide(self.frame(pair[0]), self.frame(pair[1]), mask_prev, mask_cur, prior)
 
     def look(self, features: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """The first half of `forward`, which a frame goes through alone, and so once: its channels of the tokens.

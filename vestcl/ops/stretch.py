@@ -32,17 +32,20 @@ def stretch(points_uv: Array, magnified: Array) -> tuple[Array, Array]:
     Source: `constants.TORN`; Zwicker et al., Surface Splatting, SIGGRAPH 2001, has the footprint's general form.
     """
     check(points_uv=(points_uv, "B H W 2"), magnified=(magnified, "B H W"))
-    uv, m = as_array(points_uv), as_array(magnified)
-    batch, height, width = m.shape
-    factor, opacity = np.empty_like(m), np.empty_like(m)
-    session = runtime.current()
-    if m.size:
+    factor, opacity = _stretch(runtime.current(), as_array(points_uv), as_array(magnified))
+    if isinstance(points_uv, torch.Tensor):
+        return torch.from_numpy(factor), torch.from_numpy(opacity)
+    return factor, opacity
+
+
+def _stretch(session: runtime.Session, points_uv: np.ndarray, magnified: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    batch, height, width = magnified.shape
+    factor, opacity = np.empty_like(magnified), np.empty_like(magnified)
+    if magnified.size:
         chunk, items, group = work_items(session, width)
         sizes: list[runtime.Argument] = [np.int32(height), np.int32(width), chunk]
         with session.job() as job:
-            arguments = [*sizes, *map(job.read, (uv, m)), *map(job.write, (factor, opacity))]
-            defines = runtime.defines_for(m.dtype, TORN=str(constants.TORN))
+            arguments = [*sizes, job.read(points_uv), job.read(magnified), job.write(factor), job.write(opacity)]
+            defines = runtime.defines_for(magnified.dtype, TORN=str(constants.TORN))
             job.launch("stretch.cl", "stretch", defines, (items, height, batch), arguments, (group, 1, 1))
-    if isinstance(points_uv, torch.Tensor):
-        return torch.from_numpy(factor), torch.from_numpy(opacity)
     return factor, opacity
