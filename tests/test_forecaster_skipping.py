@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from vestcl.models import configuration, skipping
 from vestcl.models._encode import encode
+from vestcl.models._render import _reaching
 from vestcl.models.config import EncoderConfig, RenderConfig
 from vestcl.models.encoder import STRIDE, Encoder, reach
 from vestcl.models.forecaster import Forecaster, Step
@@ -302,3 +303,24 @@ def test_the_inpainted_shows_in_inner_holes_alone() -> None:
 def test_inner_holes_need_to_know_what_is_open() -> None:
     with pytest.raises(ValueError, match='`inpainted` may be "inner" with `previous` "uncovered" alone'):
         RenderConfig(inpainted="inner")
+
+
+def test_no_point_is_left_out_that_reaches_an_open_pixel() -> None:
+    """Of two pictures, with points beside them, at their borders and nowhere; transparent ones reach nothing."""
+    generator = torch.Generator().manual_seed(0)
+    open_ = torch.rand(2, 1, 40, 60, generator=generator) < 0.004
+    points_uv = torch.rand(6000, 2, generator=generator) * torch.tensor([80.0, 60]) - 10
+    points_uv[::500] = torch.nan
+    radii = 0.5 + 7.5 * torch.rand(6000, generator=generator)
+    opacities, starts = (torch.arange(6000) % 7 > 0).float(), torch.tensor([0, 2500, 6000])
+    kept = torch.zeros(6000, dtype=torch.bool)
+    kept[_reaching(points_uv, radii, opacities, starts, open_)] = True
+    for b, (start, end) in enumerate(itertools.pairwise(starts.tolist())):
+        centres = open_[b, 0].nonzero().flip(1) + 0.5
+        reach = (torch.cdist(points_uv[start:end], centres) < radii[start:end, None]).any(dim=1)
+        wanted = reach & (opacities[start:end] > 0)
+        assert wanted.sum() > 300 and kept[start:end][wanted].all()
+        assert (kept[start:end] & ~wanted).sum() < 0.2 * len(wanted)
+    assert not kept[opacities == 0].any()
+    nothing = _reaching(points_uv, radii, opacities, starts, torch.zeros_like(open_))
+    assert len(nothing) == 0

@@ -4,7 +4,7 @@ else: there is no state to save, ranks share a batch without talking, and a resu
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from train import augment
 from train.augment import Window
+from vestcl.models._layers import joined
 from vestcl.models.prior import MotionPrior
 from vestcl.network_input import NetworkInput, last_motions, network_input
 from vestcl.prepared import PreparedClip
@@ -157,7 +158,7 @@ class WindowSet:
         inputs, windows = [given for given, _ in made], [window for _, window in made]
         poses = [window.future_from_cur for window in windows]
         return Batch(
-            *_joined(inputs),
+            *joined(inputs),
             draws[0].horizon,
             torch.from_numpy(np.stack([window.target for window in windows])),
             _matrices([window.tgt_from_next for window in windows]),
@@ -303,11 +304,3 @@ def _permutation(count: int, seed: int, epoch: int) -> NDArray[np.int64]:
 
 def _matrices(matrices: Sequence[NDArray[np.float64]]) -> torch.Tensor:
     return torch.from_numpy(np.stack(matrices)).float()
-
-
-def _joined(parts: Sequence[Item]) -> Item:
-    """One after the other along the first axis: tensors, or named tuples of such."""
-    first: Any = parts[0]
-    if isinstance(first, torch.Tensor):
-        return torch.cat(list(parts))  # type: ignore[arg-type, return-value]
-    return type(first)(*(_joined(field) for field in zip(*parts, strict=True)))

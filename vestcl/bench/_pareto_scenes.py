@@ -9,9 +9,8 @@ from torch.nn import functional
 from vestcl import geometry
 from vestcl.data import Street
 from vestcl.geometric import Perception
+from vestcl.models._layers import mapped
 from vestcl.models.effort import enlarged, fraction, reduced
-from vestcl.models.ego_motion import RigidMotion
-from vestcl.models.prior import MotionPrior
 from vestcl.network_input import NetworkInput, last_motions, network_input
 from vestcl.prepared import prepare_frame
 from vestcl.scene.layers import LayerBatch
@@ -59,14 +58,7 @@ def scene(seed: int, height: int, width: int, steps: int) -> Scene:
 
 def double(given: NetworkInput) -> NetworkInput:
     """The same numbers in float64."""
-    prior = given.prior
-    ahead, last, before = (
-        RigidMotion(*(part.double() for part in motion))
-        for motion in (prior.next_from_cur, prior.cur_from_prev, prior.prev_from_before)
-    )
-    prior = MotionPrior(ahead, last, before, prior.velocity_prev.double(), prior.velocity_cur.double())
-    prev, cur = (LayerBatch(*(plane.double() for plane in frame)) for frame in (given.frame_prev, given.frame_cur))
-    return NetworkInput(prev, cur, given.K.double(), prior)
+    return mapped(torch.Tensor.double, given)
 
 
 def shrunk(given: NetworkInput, scale: float) -> NetworkInput:

@@ -17,7 +17,7 @@ from vestcl.bench._splatter import by_twin
 from vestcl.bench._timing import Spread
 from vestcl.bench._traffic import Window
 from vestcl.bench.network import LEARNING_RATE
-from vestcl.models.ego_motion import RigidMotion
+from vestcl.models._layers import joined
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.prior import MotionPrior
 from vestcl.scene.layers import LayerBatch
@@ -58,26 +58,10 @@ def stacked(windows: Sequence[Window]) -> Batch:
     Args:
         windows: one or more, of one size, each with its truth.
     """
-    given = [window.given for window in windows]
     truths = [window.truth for window in windows if window.truth is not None]
-    assert len(truths) == len(given) > 0
-    prev = LayerBatch(*map(torch.cat, zip(*(one.frame_prev for one in given), strict=True)))
-    cur = LayerBatch(*map(torch.cat, zip(*(one.frame_cur for one in given), strict=True)))
-    priors = [one.prior for one in given]
-    prior = MotionPrior(
-        _motions([one.next_from_cur for one in priors]),
-        _motions([one.cur_from_prev for one in priors]),
-        _motions([one.prev_from_before for one in priors]),
-        torch.cat([one.velocity_prev for one in priors]),
-        torch.cat([one.velocity_cur for one in priors]),
-    )
-    return Batch(prev, cur, torch.cat([one.K for one in given]), prior, torch.cat(truths))
-
-
-def _motions(one_by_one: Sequence[RigidMotion]) -> RigidMotion:
-    return RigidMotion(
-        torch.cat([one.quaternion for one in one_by_one]), torch.cat([one.translation for one in one_by_one])
-    )
+    assert len(truths) == len(windows) > 0
+    given = joined([window.given for window in windows])
+    return Batch(given.frame_prev, given.frame_cur, given.K, given.prior, torch.cat(truths))
 
 
 @dataclass(frozen=True)

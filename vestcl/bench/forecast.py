@@ -251,10 +251,10 @@ def _write(
         _results.write_json(
             config.out, {"machine": machine, "config": settings, "inputs": [_told(group) for group in groups]}
         )
-        console.print(f"wrote {config.out}", soft_wrap=True, highlight=False)
+        _results.tell_written(console, config.out)
     if config.markdown is not None:
         write_bytes(config.markdown, "\n".join(map(tables.to_markdown, grids)).encode())
-        console.print(f"wrote {config.markdown}", soft_wrap=True, highlight=False)
+        _results.tell_written(console, config.markdown)
 
 
 def _told(group: _Group) -> dict[str, Any]:

@@ -168,7 +168,7 @@ def main(config: NetworkBench) -> None:
         settings = dataclasses.asdict(config) | {"json": str(config.json)}
         results = {"machine": machine, "config": settings, "parts": [dataclasses.asdict(part) for part in parts]}
         _results.write_json(config.json, results)
-        console.print(f"wrote {config.json}", soft_wrap=True)
+        _results.tell_written(console, config.json)
 
 
 def street_frames(height: int, width: int, seed: int, count: int = 3) -> tuple[list[Frame], np.ndarray]:

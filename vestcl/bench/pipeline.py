@@ -74,9 +74,7 @@ def main(config: PipelineBench) -> None:
     with trace.record(config.trace), _timing.torch_threads(config.threads):
         results = _results.measure_each(config.device, partial(_measure_device, config, model, console), console)
     _results.save(results, config.json, config.markdown)
-    for path in (config.json, config.markdown, config.trace, config.plots):
-        if path is not None:
-            console.print(f"wrote {path}", soft_wrap=True, highlight=False)
+    _results.tell_written(console, config.json, config.markdown, config.trace, config.plots)
 
 
 def load(config: PipelineBench) -> Forecaster:

@@ -129,7 +129,7 @@ def main(config: StabilityBench) -> int:
     if config.plots is not None:
         for session_rows, result in zip(rows, results, strict=True):
             path = _stability_plots.draw(session_rows, families, result.machine["device"], config.plots)
-            console.print(f"wrote {path}", soft_wrap=True)
+            _results.tell_written(console, path)
     broken = [f"{row.family} {row.knob:g}: {', '.join(row.broken)}" for of in rows for row in of if row.broken]
     for line in broken:
         console.print(f"[red]bound broken[/]: {line}", soft_wrap=True, highlight=False)

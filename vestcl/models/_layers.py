@@ -1,13 +1,16 @@
 """What several networks share: shapes checked at the boundary, normalisation, exact resizing, depth as an input."""
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
 from torch.nn import functional
 
 from vestcl.models.config import LOG_DEPTH_FAR, LOG_DEPTH_NEAR
+
+Nested = TypeVar("Nested")
+"""A tensor, or a named tuple of tensors and such."""
 
 
 def check(**arguments: tuple[torch.Tensor, str]) -> dict[str, int]:
@@ -120,6 +123,21 @@ def frame_pair(
 def frame_planes(features: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """[F, log(clamp(D)), M] of a frame, [B, channels + 2, H, W]; arguments as of `frame_pair`, not checked."""
     return side_by_side([features, depth.clamp(LOG_DEPTH_NEAR, LOG_DEPTH_FAR).log(), mask])
+
+
+def joined(parts: Sequence[Nested]) -> Nested:
+    """One after the other along the first axis: tensors, or named tuples of such, however deep."""
+    first: Any = parts[0]
+    if isinstance(first, torch.Tensor):
+        return torch.cat(list(parts))  # type: ignore[arg-type, return-value]
+    return type(first)(*(joined(field) for field in zip(*parts, strict=True)))
+
+
+def mapped(function: Callable[[torch.Tensor], torch.Tensor], value: Nested) -> Nested:
+    """``function`` of a tensor, or of each in named tuples of such, however deep."""
+    if isinstance(value, torch.Tensor):
+        return function(value)  # type: ignore[return-value]
+    return type(value)(*(mapped(function, part) for part in value))  # type: ignore[attr-defined]
 
 
 def tensors_in(value: Any) -> Iterator[torch.Tensor]:
