@@ -144,6 +144,16 @@ def test_bases_that_are_absent_or_in_a_circle(small: Path) -> None:
     assert "must hold a mapping" in error_of(small)
 
 
+def test_a_stage_says_what_differs_in_its_loss(small: Path) -> None:
+    config = load_config(small, ["loss.ssim=0.2", "loss.pose.rotation=3", "stages.second.loss.pose.translation=2"])
+    first, second = (config.loss_of(stage) for stage in config.stages)
+    assert first == config.loss and (first.pose.rotation, first.pose.translation) == (3, 0)
+    assert (second.ssim, second.pose.rotation, second.pose.translation) == (0.2, 3, 2)
+    assert second.perceptual == first.perceptual
+    assert from_dict(to_dict(config)) == config
+    assert "`stages.1.loss.sim`" in error_of(small, "stages.second.loss.sim=1")
+
+
 def test_a_stage_says_what_differs_in_its_data(small: Path) -> None:
     config = load_config(small, ["data.colour=0.5", "stages.second.data.flip=false", "stages.first.data.crop=[8, 8]"])
     first, second = config.stages

@@ -70,7 +70,7 @@ def _read(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     if not isinstance(settings, dict):
         raise ValueError(f"{path} must hold a mapping of keys to values, got {type(settings).__name__}")
     base = settings.pop(BASE, None)
-    return settings if base is None else _merged(_read(path.parent / str(base), (*above, path)), settings)
+    return settings if base is None else merged(_read(path.parent / str(base), (*above, path)), settings)
 
 
 def _parse(text: str, source: str) -> Any:
@@ -80,9 +80,9 @@ def _parse(text: str, source: str) -> Any:
         raise ValueError(f"{source} must be YAML: {error}") from error
 
 
-def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     both = {
-        key: _merged(below[key], above[key])
+        key: merged(below[key], above[key])
         for key in below.keys() & above.keys()
         if isinstance(below[key], dict) and isinstance(above[key], dict)
     }

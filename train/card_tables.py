@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from train.card_pictures import PARTS, Rows, stages_of
-from train.config import Config, DataConfig
+from train.config import Config, DataConfig, LossConfig
 from train.fit import window_set
 from vestcl.data import Street
 from vestcl.models.config import ModelConfig
@@ -198,7 +198,10 @@ def training_table(config: Config, rows: Rows, step: int, machine: str | None, v
                       size + scale, *seconds.get(stage.name, ("-", "-"))))  # fmt: skip
     heading = ("stage", "learns", "renders", "steps", "batch", "learning rate", "size", "minutes", "splatting")
     note = "Splatting: its share of the time, forward and backward."
-    lines = [_loss(config), _optimiser(config), f"Packages: {versions}."] + [f"Machine: {machine}."] * bool(machine)
+    losses = [f"In stage {stage.name}: {_loss(stage.loss)}" for stage in config.stages if stage.loss is not None]
+    lines = [f"Loss: {_loss(config.loss)}", *losses, _optimiser(config), f"Packages: {versions}."] + [
+        f"Machine: {machine}."
+    ] * bool(machine)
     return "\n\n".join([to_markdown(Grid("Stages", heading, tuple(cells), (note,))).rstrip(), *lines])
 
 
@@ -216,13 +219,13 @@ def _stage_seconds(rows: Rows) -> dict[str, tuple[str, str]]:
     return told
 
 
-def _loss(config: Config) -> str:
-    loss, perceptual = config.loss, config.loss.perceptual
+def _loss(loss: LossConfig) -> str:
+    perceptual = loss.perceptual
     weights = {"L1": loss.l1, "1 - SSIM": loss.ssim, "rotation (1/rad)": loss.pose.rotation,
                "translation (1/m)": loss.pose.translation, "residual motion": loss.residual_motion}  # fmt: skip
     if perceptual.kind != "none":
         weights[f"perceptual ({perceptual.kind})"] = perceptual.weight
-    return f"Loss: {', '.join(f'{name} x {weight:g}' for name, weight in weights.items() if weight)}."
+    return f"{', '.join(f'{name} x {weight:g}' for name, weight in weights.items() if weight)}."
 
 
 def _optimiser(config: Config) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 from pydantic import ConfigDict, Field, Strict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from train._settings import in_words, read_settings
+from train._settings import in_words, merged, read_settings
 from vestcl.models import configuration
 
 Part = Literal["encoder", "ego_motion", "object_motion", "refine"]
@@ -59,38 +59,6 @@ class DataConfig:
             raise ValueError(f"`scale` must be the smallest factor and then the largest, got {list(self.scale)}")
         if self.frames and self.frames[1] < self.frames[0] + 2:
             raise ValueError(f"`frames` must hold three frames or more, first to last, got {list(self.frames)}")
-
-
-@dataclass(frozen=True, config=_RULES)
-class Stage:
-    """A part of the run: what learns, how fast and how long."""
-
-    name: Annotated[str, Field(pattern=r"^[A-Za-z][\w-]*$")]
-    """A word of letters, digits, "_" and "-"; overrides may name the stage by it (``stages.all.steps=10``)."""
-    steps: Count
-    """Updates of the weights."""
-    batch: Count = 4
-    """Samples an update, over all processes."""
-    learning_rate: Annotated[float, Field(gt=0, le=1)] = 1e-4
-    """After the warm-up; from there it falls along a cosine."""
-    warm_up: CountOrNone = 0
-    """Steps in which the learning rate rises from 0."""
-    train: tuple[Part, ...] = ("encoder", "ego_motion", "object_motion", "refine")
-    """The parts that learn; all others are frozen."""
-    render: bool = True
-    """False leaves out splatting, refinement and all of the loss but the pose's: the cheap way to a camera's motion."""
-    crop: tuple[Count, Count] | None = None
-    """In place of the data's."""
-    data: DataConfig | None = None
-    """In place of the run's; in files and overrides, the fields that differ."""
-
-    def __post_init__(self) -> None:
-        if self.warm_up >= self.steps:
-            raise ValueError(f"`warm_up` must be below `steps` = {self.steps}, got {self.warm_up}")
-        if not self.train or len(set(self.train)) < len(self.train):
-            raise ValueError(f"`train` must name one part or more, each once, got {list(self.train)}")
-        if not self.render and not {"encoder", "ego_motion"} >= set(self.train):
-            raise ValueError(f"`train` must be of encoder and ego_motion where `render` is off, got {list(self.train)}")
 
 
 @dataclass(frozen=True, config=_RULES)
@@ -143,6 +111,40 @@ class LossConfig:
     pose: PoseConfig = PoseConfig()
     residual_motion: Weight = 0.0
     """Of how far object motion strays from the rigid flow, relative to depth."""
+
+
+@dataclass(frozen=True, config=_RULES)
+class Stage:
+    """A part of the run: what learns, how fast and how long."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][\w-]*$")]
+    """A word of letters, digits, "_" and "-"; overrides may name the stage by it (``stages.all.steps=10``)."""
+    steps: Count
+    """Updates of the weights."""
+    batch: Count = 4
+    """Samples an update, over all processes."""
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = 1e-4
+    """After the warm-up; from there it falls along a cosine."""
+    warm_up: CountOrNone = 0
+    """Steps in which the learning rate rises from 0."""
+    train: tuple[Part, ...] = ("encoder", "ego_motion", "object_motion", "refine")
+    """The parts that learn; all others are frozen."""
+    render: bool = True
+    """False leaves out splatting, refinement and all of the loss but the pose's: the cheap way to a camera's motion."""
+    crop: tuple[Count, Count] | None = None
+    """In place of the data's."""
+    data: DataConfig | None = None
+    """In place of the run's; in files and overrides, the fields that differ."""
+    loss: LossConfig | None = None
+    """The same."""
+
+    def __post_init__(self) -> None:
+        if self.warm_up >= self.steps:
+            raise ValueError(f"`warm_up` must be below `steps` = {self.steps}, got {self.warm_up}")
+        if not self.train or len(set(self.train)) < len(self.train):
+            raise ValueError(f"`train` must name one part or more, each once, got {list(self.train)}")
+        if not self.render and not {"encoder", "ego_motion"} >= set(self.train):
+            raise ValueError(f"`train` must be of encoder and ego_motion where `render` is off, got {list(self.train)}")
 
 
 @dataclass(frozen=True, config=_RULES)
@@ -231,6 +233,10 @@ class Config:
         data = stage.data or self.data
         return data if stage.crop is None else dataclasses.replace(data, crop=stage.crop)
 
+    def loss_of(self, stage: Stage) -> LossConfig:
+        """What ``stage`` minimises: its own loss or else the run's."""
+        return stage.loss or self.loss
+
 
 def load_config(path: Path | str, overrides: Sequence[str] = ()) -> Config:
     """A configuration from a YAML file, the files that it builds on, and what the command line changes.
@@ -270,20 +276,19 @@ def from_dict(settings: Mapping[str, Any]) -> Config:
 
 def _checked(settings: Mapping[str, Any], source: str) -> Config:
     try:
-        return _ADAPTER.validate_python(_with_stage_data(settings))
+        return _ADAPTER.validate_python(_with_stage_parts(settings))
     except ValidationError as error:
         raise ValueError(in_words(error, Config, source)) from error
 
 
-def _with_stage_data(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """A stage's ``data`` says what differs from the run's."""
-    data, stages = settings.get("data"), settings.get("stages")
-    if not isinstance(data, Mapping) or not isinstance(stages, Sequence):
+def _with_stage_parts(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """A stage's ``data`` and ``loss`` say what differs from the run's."""
+    stages = settings.get("stages")
+    if not isinstance(stages, Sequence) or not all(isinstance(stage, Mapping) for stage in stages):
         return dict(settings)
+    whole = {name: settings[name] for name in ("data", "loss") if isinstance(settings.get(name), Mapping)}
     full = [
-        {**stage, "data": {**data, **stage["data"]}}
-        if isinstance(stage, Mapping) and isinstance(stage.get("data"), Mapping)
-        else stage
+        {**stage, **{name: merged(whole[name], stage[name]) for name in whole if isinstance(stage.get(name), Mapping)}}
         for stage in stages
     ]
     return {**settings, "stages": full}

@@ -131,7 +131,7 @@ class _Run:
         self.config, self.ranks, self.stop = config, ranks, stop
         self.model: Forecaster = build_model(config)
         self.average = Average(self.model, config.optimiser.ema) if config.optimiser.ema else None
-        self.perceptual = build_perceptual(config.loss)
+        self.perceptual = {loss: build_perceptual(loss) for loss in map(config.loss_of, config.stages)}
         self.step = 0
 
     def go(self, state: State | None) -> bool:
@@ -143,7 +143,8 @@ class _Run:
         with self.report.bar(self.step):
             while self.step < self.config.steps:
                 position = self.config.position(self.step)
-                trainer = Trainer(self.config, position.stage, self.model, self.perceptual, self.ranks)
+                perceptual = self.perceptual[self.config.loss_of(position.stage)]
+                trainer = Trainer(self.config, position.stage, self.model, perceptual, self.ranks)
                 if state is not None and position.step:
                     trainer.restore(state.optimiser, state.scheduler)
                 state = None

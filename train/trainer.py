@@ -97,7 +97,7 @@ class Trainer:
         config: of the run.
         stage: of ``config``; its parts learn, all others are frozen.
         model: in training mode.
-        perceptual: from `train.losses.build_perceptual`.
+        perceptual: from `train.losses.build_perceptual` of the stage's loss.
         ranks: the processes that share each batch; gradients are means over them.
     """
 
@@ -125,7 +125,7 @@ class Trainer:
             prior=batch.prior if self._starts_from_prior() else None, horizon=batch.horizon,
         )  # fmt: skip
         view = step.views[0] if step.views else None
-        loss, terms = total_loss(view, step, batch, self.config.loss, self._perceptual)
+        loss, terms = total_loss(view, step, batch, self.config.loss_of(self.stage), self._perceptual)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self._learning, self.config.optimiser.clip_norm or math.inf)
         broken = self.ranks.any(not (math.isfinite(loss.item()) and math.isfinite(norm.item())))
