@@ -16,6 +16,9 @@ from vestcl.scene.layers import LayerBatch
 #: Frames that are remembered: the next step's two inputs.
 _REMEMBERED = 2
 
+#: Every so many rows and columns are compared before all are.
+_SOME = 16
+
 
 class Memory:
     """The last frames that were encoded, for when they come again: as long as weights and settings stay the same."""
@@ -111,4 +114,7 @@ def _pixels(layers: LayerBatch, frames: int) -> int:
 
 
 def _same(one: torch.Tensor, other: torch.Tensor) -> bool:
-    return one is other or (one.dtype == other.dtype and torch.equal(one, other))
+    if one is other:
+        return True
+    some = one[..., ::_SOME, ::_SOME], other[..., ::_SOME, ::_SOME]  # of two frames a few pixels tell that
+    return one.dtype == other.dtype and torch.equal(*some) and torch.equal(one, other)

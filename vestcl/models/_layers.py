@@ -93,8 +93,8 @@ def frame_pair(
     mask_prev: torch.Tensor,
     mask_cur: torch.Tensor,
     channels: int,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """What the motion networks see of two frames: [F, log(clamp(D)), M] of each.
+) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """What the motion networks see of two frames: F, log(clamp(D)), M of each, for `side_by_side`.
 
     Args:
         features_prev: [B, channels, H, W] at t - 1.
@@ -106,7 +106,7 @@ def frame_pair(
         channels: that the features must have.
 
     Returns:
-        Two [B, channels + 2, H, W]; differentiable in all.
+        Twice [B, channels, H, W] and two [B, 1, H, W]; differentiable in all.
 
     Raises:
         ValueError: an argument of another shape.
@@ -120,9 +120,9 @@ def frame_pair(
     return frame_planes(features_prev, depth_prev, mask_prev), frame_planes(features_cur, depth_cur, mask_cur)
 
 
-def frame_planes(features: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """[F, log(clamp(D)), M] of a frame, [B, channels + 2, H, W]; arguments as of `frame_pair`, not checked."""
-    return side_by_side([features, depth.clamp(LOG_DEPTH_NEAR, LOG_DEPTH_FAR).log(), mask])
+def frame_planes(features: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor) -> list[torch.Tensor]:
+    """F, log(clamp(D)), M of a frame; arguments as of `frame_pair`, not checked."""
+    return [features, depth.clamp(LOG_DEPTH_NEAR, LOG_DEPTH_FAR).log(), mask]
 
 
 def joined(parts: Sequence[Nested]) -> Nested:

@@ -7,7 +7,7 @@ from torch import nn
 from torch.nn import functional
 
 from vestcl import geometry
-from vestcl.models._layers import frame_pair, frame_planes
+from vestcl.models._layers import frame_pair, frame_planes, side_by_side
 from vestcl.models.config import EgoMotionConfig
 
 #: (stride, dilation) of the four convolutions: the one reading of the paper's table that agrees with its sizes.
@@ -147,7 +147,8 @@ class EgoMotion(nn.Module):
             ValueError: an argument of another shape, or a prior missing or not asked for.
         """
         pair = frame_pair(features_prev, features_cur, depth_prev, depth_cur, mask_prev, mask_cur, self.features)
-        return self.decide(self.frame(pair[0]), self.frame(pair[1]), mask_prev, mask_cur, prior)
+        prev, cur = (cast(torch.Tensor, self.frame(side_by_side(planes))) for planes in pair)
+        return self.decide(prev, cur, mask_prev, mask_cur, prior)
 
     def look(self, features: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """The first half of `forward`, which a frame goes through alone, and so once: its channels of the tokens.
@@ -160,7 +161,7 @@ class EgoMotion(nn.Module):
         Returns:
             [B, channels, ceil(h / 4), ceil(w / 4)]; differentiable.
         """
-        return cast(torch.Tensor, self.frame(frame_planes(features, depth, mask)))
+        return cast(torch.Tensor, self.frame(side_by_side(frame_planes(features, depth, mask))))
 
     def decide(
         self,

@@ -95,7 +95,7 @@ class FastForecaster(Forecaster):
         self.skip, self.effort = model.skip, model.effort
         self.autocast = torch.bfloat16 if precision == "bfloat16" else None
         if self.object_motion is not None:
-            share_frames(self.object_motion)
+            share_frames(self.object_motion, self.effort.blocks)
         self.eval()
         for parameter in self.parameters():
             parameter.requires_grad_(False)
@@ -151,7 +151,7 @@ def _without_gradient(task: Callable[..., Any], *arguments: Any, **named: Any) -
 # ---------------------------------------------------------------- object motion
 
 
-def share_frames(network: ObjectMotion) -> bool:
+def share_frames(network: ObjectMotion, blocks: int | None = None) -> bool:
     """Let the blocks of ``network`` share one convolution over the frames, for inference; its outputs stay the same.
 
     A block begins with conv(frames) + conv(U), at full size and at its own scale, and the frames are the same for all
@@ -160,6 +160,7 @@ def share_frames(network: ObjectMotion) -> bool:
     Args:
         network: object motion of shape "dmvfn" without routing; its weights may be changed by `load_state_dict` alone
             from now on.
+        blocks: the first so many share, as more are not going to run (see `Effort.blocks`); None is all.
 
     Returns:
         Whether they do. Others stay as they are: blocks that routing leaves out would be computed after all, and at the
@@ -168,7 +169,7 @@ def share_frames(network: ObjectMotion) -> bool:
     if network.config.shape != "dmvfn" or network.routing is not None:
         return False
     entering: dict[int, list[tuple[MotionBlock, str]]] = {}
-    for block in network.blocks:
+    for block in network.blocks[:blocks]:
         assert isinstance(block, MotionBlock)
         entering.setdefault(1, []).append((block, "full_in"))
         entering.setdefault(block.scale, []).append((block, "shrunk_in"))

@@ -85,11 +85,11 @@ class ObjectMotion(nn.Module):
         Raises:
             ValueError: an argument of another shape.
         """
-        pair = frame_pair(features_prev, features_cur, depth_prev, depth_cur, mask_prev, mask_cur, self.features)
+        prev, cur = frame_pair(features_prev, features_cur, depth_prev, depth_cur, mask_prev, mask_cur, self.features)
         batch, _, height, width = features_prev.shape
         check(flow0=(flow0, f"{batch} {MOTION_CHANNELS} {height} {width}"))
-        frames, flow = self._pad(side_by_side(pair)), self._pad(flow0)
-        shrunk = {scale: shrink(frames, scale) for scale in set(self.scales)}
+        frames, flow = self._pad(side_by_side([*prev, *cur])), self._pad(flow0)
+        shrunk = {scale: shrink(frames, scale) for scale in {max(self.scales), *self.scales[:blocks]}}
         if self.routing is None:
             probabilities, gates = None, flow.new_ones(len(flow), len(self.blocks))
         else:
