@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Iterable
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 from torch.nn import functional
@@ -62,29 +62,49 @@ def move_objects(
     found = _where(network, moving, skip, tally, blocks)
     if not found:
         return unmoved(start)
-    beyond = torch.cat([
-        (1 - LOG_DEPTH_FAR / frame.layers.depth).clamp(min=0) * (flow - rigid.translation[:, :, None, None])
-        for frame, rigid, flow in zip((prev, cur), to_next[:2], flow0.split(3, dim=1), strict=True)
-    ], dim=1)  # fmt: skip
-    near = start - beyond
-    seen = [
-        *(frame.features for frame in (prev, cur)),
-        *(frame.layers.depth for frame in (prev, cur)),
-        *(frame.layers.mask for frame in (prev, cur)),
-        near,
-    ]
-    parts = [network(*map(box.cut, seen), blocks=blocks) for box in found]
-    moves = moving.repeat_interleave(3, dim=1) if network.config.where == "foreground" else None
+    seen = [prev.features, cur.features]
+    seen += [prev.layers.depth, cur.layers.depth, prev.layers.mask, cur.layers.mask]
+    flows = list(zip((prev, cur), to_next[:2], flow0.split(3, dim=1), strict=True))
+    pieces, forecasts = list[_Piece](), list[ObjectMotionForecast]()
+    for box in found:
+        beyond = torch.cat([
+            (1 - LOG_DEPTH_FAR / box.cut(frame.layers.depth)).clamp(min=0)
+            * (box.cut(flow) - rigid.translation[:, :, None, None])
+            for frame, rigid, flow in flows
+        ], dim=1)  # fmt: skip
+        moves = box.cut(moving) if network.config.where == "foreground" else None
+        pieces.append(_Piece(box, beyond, box.cut(start), moves))
+        forecasts.append(network(*map(box.cut, seen), box.cut(start) - beyond, blocks=blocks))
 
-    def whole(pieces: Iterable[torch.Tensor]) -> torch.Tensor:
-        flow = near.clone()
-        for box, piece in zip(found, pieces, strict=True):
-            box.cut(flow).copy_(piece)
-        return flow + beyond if moves is None else torch.where(moves, flow + beyond, start)
+    def whole(parts: Iterable[torch.Tensor]) -> torch.Tensor:
+        flow = start.clone()
+        for piece, part in zip(pieces, parts, strict=True):
+            piece.box.cut(flow).copy_(piece.finished(part))
+        return flow
 
     learning = torch.is_grad_enabled()  # losses alone look at candidates
-    candidates = [whole(each) for each in zip(*(part.candidates for part in parts), strict=True)] if learning else []
-    return parts[0]._replace(flow=whole(part.flow for part in parts), candidates=candidates)
+    candidates = [whole(each) for each in zip(*(one.candidates for one in forecasts), strict=True)] if learning else []
+    return forecasts[0]._replace(flow=whole(one.flow for one in forecasts), candidates=candidates)
+
+
+class _Piece(NamedTuple):
+    """Of the picture: what OMF is not shown of it, and what it may change."""
+
+    box: Box
+    beyond: torch.Tensor
+    """[B, 6, h, w] m, taken off what OMF sees."""
+    start: torch.Tensor
+    """[B, 6, h, w] m."""
+    moves: torch.Tensor | None
+    """bool [B, 2, h, w]; None is all."""
+
+    def finished(self, flow: torch.Tensor) -> torch.Tensor:
+        """OMF's answer with what was taken off; ``start`` where nothing may move."""
+        flow = flow + self.beyond
+        if self.moves is None:
+            return flow
+        flow, start = (motion.unflatten(1, (2, 3)) for motion in (flow, self.start))
+        return torch.where(self.moves[:, :, None], flow, start).flatten(1, 2)
 
 
 def _rolling(foreground: torch.Tensor, beside: torch.Tensor) -> torch.Tensor:
