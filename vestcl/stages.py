@@ -11,7 +11,8 @@ from vestcl import trace
 if TYPE_CHECKING:  # it needs torch, which takes seconds to import
     from vestcl.models.forecaster import Forecaster
 
-#: Method of a `Forecaster` -> what tables call it, in the order that they run in. What no stage has is REST.
+#: Method of a `Forecaster` -> what tables call it, in the order that they run in. What no stage has is REST. What EMF
+#: sees of a frame by itself is found out, and remembered, with the frame's features: it counts as "encode".
 STAGES: Final = {
     "encode": "encode",
     "move_camera": "EMF",
