@@ -1,5 +1,6 @@
 """The processes that train together: started by torchrun, or one alone."""
 
+import gc
 import os
 from dataclasses import dataclass
 from datetime import timedelta
@@ -73,8 +74,13 @@ class Ranks:
         return alike[self.local % len(alike)] if alike else None
 
     def leave(self) -> None:
-        """Say goodbye to the others."""
+        """Say goodbye to the others.
+
+        What holds the group in a cycle, as DistributedDataParallel does, goes first: a thread of the group that is
+        still there when Python ends may abort the process.
+        """
         if distributed.is_initialized():
+            gc.collect()
             distributed.destroy_process_group()
 
 
