@@ -5,7 +5,7 @@
 //   stretch = max(1, max(h, v) / m),   opacity = 1 where one of both counts, else 0
 //
 // Parallel over images, rows and chunks of a row, as unproject.
-//   TORN  see vestcl/ops/stretch.py
+//   TORN  see vestcl/constants.py
 #include "common.h"
 
 #define SMALLEST_PIXEL ((REAL)1e-6)

@@ -66,26 +66,8 @@ def test_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     last = runtime.devices()[-1].index
     before = runtime.current()
     assert cli.main(["demo"]) == 0
-    assert (
-        cli.main(
-            [
-                "demo",
-                "--out",
-                "x",
-                "--height",
-                "8",
-                "--width",
-                "9",
-                "--seed",
-                "3",
-                "--quality",
-                "fast",
-                "--device",
-                last,
-            ]
-        )
-        == 0
-    )
+    options = "--out x --height 8 --width 9 --seed 3 --quality fast --device"
+    assert cli.main(["demo", *options.split(), last]) == 0
     assert cli.main(["demo", "--model", "geometric"]) == 0
     usual, given, geometric = calls
     assert usual == (Path("out"), 256, 832, 0, None, "balanced", before.info.index)

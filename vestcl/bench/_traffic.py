@@ -4,7 +4,7 @@
     traffic         the street as it is generated
     jam             slow, both lanes full
     everything      no street: foreground scattered all over two walls, all of it moving, every frame another one, seen
-                    from the side, so that nothing can be skipped
+                    from the side, so that nothing can be skipped but points that the newer frame covers
 
 Depth and masks are given, everything else is measured as in use: the camera's motion and things' velocities by
 `Perception`, outside of all timing.

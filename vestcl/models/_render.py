@@ -154,9 +154,10 @@ def splat_cloud(
         hidden = cloud.inpainted.nonzero()[:, 0]
         opacities[hidden] *= _found(points_uv.detach()[hidden], torch.searchsorted(hidden, starts), deep)
     if open_ is not None and tally is not None:
-        kept, worth = _reaching(points_uv.detach(), radii.detach(), opacities, starts, open_), _WORTH * len(z)
-        tally.add("covered", len(z) - len(kept) if len(kept) < worth else 0, len(z), "points")
-        if len(kept) < worth:
+        kept = _reaching(points_uv.detach(), radii.detach(), opacities, starts, open_)
+        worth = len(kept) < _WORTH * len(z)
+        tally.add("covered", (len(z) - len(kept)) * worth, len(z), "points")
+        if worth:
             starts = torch.searchsorted(kept, starts)
             cloud = cloud.picked(kept, starts)
             points_uv, order, near, radii, opacities = (t[kept] for t in (points_uv, order, near, radii, opacities))
