@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 OUT ?= out
 
-.PHONY: venv demo test lint bench oclgrind devices-test clean
+.PHONY: venv demo test lint bench stress oclgrind devices-test clean
 
 venv: .venv/.installed
 
@@ -36,6 +36,10 @@ bench: venv
 	$(BIN)/vestcl bench inpaint
 	$(BIN)/vestcl bench network
 	$(BIN)/vestcl bench forecast street:
+
+# What `make test` runs a tenth of: interrupts, fuzzed scenes, damaged caches, bad input. Each is seeded and says what failed.
+stress: venv
+	for script in tests/stress/*.py; do $(BIN)/python "$$script" || exit 1; done
 
 # The operators' tests on every OpenCL device of this machine instead of the default one.
 devices-test: venv
