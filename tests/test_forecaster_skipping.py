@@ -17,7 +17,7 @@ from vestcl.models.config import EncoderConfig, RenderConfig
 from vestcl.models.encoder import STRIDE, Encoder, reach
 from vestcl.models.forecaster import Forecaster, Step
 from vestcl.models.object_motion import ObjectMotion
-from vestcl.models.skipping import NOTHING, Box, Skip, Tally, boxes
+from vestcl.models.skipping import NOTHING, Box, Skip, Tally, boxes, count_skips
 from vestcl.scene.layers import LayerBatch
 
 #: As vest-s in all that can be skipped, and with convolutions that reach so little that a picture has room around it.
@@ -38,15 +38,14 @@ def scene(batch: int = 1, *, foreground: bool = True) -> tuple[LayerBatch, Layer
 
 def forecast(model: Forecaster, pair: tuple[LayerBatch, LayerBatch], skip: Skip) -> tuple[Step, Tally]:
     batch = len(pair[0].image)
-    model.skip, model.tally = skip, Tally()
+    model.skip = skip
     K = camera(batch, HEIGHT, WIDTH)
     aside = torch.eye(4).repeat(batch, 1, 1)
     aside[:, 0, 3] = 0.4
     prior = measured(batch, HEIGHT, WIDTH, cur=(0.1, 0, -0.8), velocity=(0.3, 0, 0.2))
-    with torch.no_grad():
-        return model(
-            *pair, K, [(aside, K), (torch.eye(4).repeat(batch, 1, 1), K), (aside, K)], prior=prior
-        ), model.tally
+    views = [(aside, K), (torch.eye(4).repeat(batch, 1, 1), K), (aside, K)]
+    with torch.no_grad(), count_skips() as tally:
+        return model(*pair, K, views, prior=prior), tally
 
 
 @pytest.fixture(autouse=True)
@@ -105,14 +104,14 @@ def test_what_stands_is_taken_to_stand() -> None:
     for velocity in (prior.velocity_prev, prior.velocity_cur):
         velocity[:, 2, 32:64, 32:80] = 0.8
         velocity[:, 2, 40, 210] = 0.8
-    network.skip, network.tally = Skip(margin=0, still=True), Tally()
-    with torch.no_grad():
+    network.skip = Skip(margin=0, still=True)
+    with torch.no_grad(), count_skips() as tally:
         motion = network.forecast(prev, cur, K, 1, [], "compose", prior=prior)[0].motion
     moved = (motion.objects.flow != motion.start).any(dim=1)[0]
     assert moved[32:64, 32:80].float().mean() > 0.9
     moved[32:64, 32:80] = False
     assert not moved.any()
-    count = network.tally.counts["objects"]
+    count = tally.counts["objects"]
     assert count.skipped > count.of * 0.7
 
 
@@ -184,11 +183,11 @@ def test_a_frame_seen_before_is_not_encoded_again() -> None:
         again = LayerBatch(*(tensor.clone() for tensor in prev)), LayerBatch(*(tensor.clone() for tensor in cur))
         return network(*again, K, prior=prior).views[0].image
 
-    with torch.no_grad():
+    with torch.no_grad(), count_skips() as tally:
         fresh = run(first, second), len(calls)
         run(second, third)
         assert len(calls) == fresh[1] // 2
-        assert network.tally.counts["seen"] == (1, 4, "frames")
+        assert tally.counts["seen"] == (1, 4, "frames")
         assert torch.equal(run(first, second), fresh[0]) and len(calls) == fresh[1], "two are remembered"
         assert torch.equal(run(first, second), fresh[0]) and not calls
         network.encoder.out.bias.add_(1)

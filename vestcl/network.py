@@ -11,7 +11,7 @@ from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, Skipped, View
 from vestcl.geometric.perception import Perception
 from vestcl.models.forecaster import Forecaster, Mode, RenderedView
-from vestcl.models.skipping import Count, Tally
+from vestcl.models.skipping import Count, Tally, count_skips
 from vestcl.network_input import NetworkInput, last_motions, network_input
 from vestcl.prepared import prepare_frame
 from vestcl.stages import watching, with_rest
@@ -90,8 +90,8 @@ def forecast_frames(
         raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
     given = _given(perception, index)
     tell("network")
-    start, model.tally = time.perf_counter(), Tally()
-    with torch.inference_mode(), watching(model) as watch:
+    start = time.perf_counter()
+    with torch.inference_mode(), watching() as watch, count_skips() as tally:
         done = model.forecast(
             given.frame_prev, given.frame_cur, given.K, steps, cameras(views, given), mode,
             prior=given.prior if model.config.start == "prior" else None,
@@ -101,7 +101,7 @@ def forecast_frames(
     motions = [step.future_from_cur[0].double().numpy() for step in done]
     whole = time.perf_counter() - start
     profile = with_rest(watch.take(), whole)
-    skipped = what_was_skipped(model.tally, profile)
+    skipped = what_was_skipped(tally, profile)
     return Forecast(model.config.name, motions, frames, perception.seconds | {"network": whole}, profile, skipped)
 
 

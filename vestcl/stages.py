@@ -1,18 +1,29 @@
-"""Where a network's forecast spends its time: a clock on each of its stages."""
+"""Where a network's forecast spends its time: a clock for its stages, which leaves the model as it is.
+
+The stages of `vestcl.models.forecaster.Forecaster` are methods with `timed`. They report to the clock of the running
+thread (a context variable), so forecasts in several threads, with one model or several, are timed separately::
+
+    with watching() as watch:
+        model.forecast(...)
+    watch.seconds  # {"encode": 0.31, "EMF": 0.01, ...}
+
+Each stage is also a span of `vestcl.trace` and a `torch.profiler.record_function`, by the same name.
+"""
 
 import contextlib
+import functools
 import time
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, ParamSpec, TypeVar
+
+from torch.profiler import record_function
 
 from vestcl import trace
 
-if TYPE_CHECKING:  # it needs torch, which takes seconds to import
-    from vestcl.models.forecaster import Forecaster
-
-#: Method of a `Forecaster` -> what tables call it, in the order that they run in. What no stage has is REST. What EMF
-#: sees of a frame by itself is found out, and remembered, with the frame's features: it counts as "encode".
+#: Method of a `Forecaster` -> its name in tables, in the order that they run in. All other time is REST. What EMF
+#: computes from one frame is kept with the frame's features: it counts as "encode".
 STAGES: Final = {
     "encode": "encode",
     "move_camera": "EMF",
@@ -22,8 +33,14 @@ STAGES: Final = {
     "paint": "refine",
 }
 
-#: Rigid flow of both frames, checks, comparing frames with those seen before, composing the view.
+#: Rigid flow of both frames, checks, composing the view.
 REST: Final = "rest"
+
+Seen = Callable[[str, Any], None]
+"""Called with a stage's name and result."""
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 
 
 @dataclass
@@ -31,14 +48,23 @@ class Stopwatch:
     """Seconds by stage, summed up until `take`."""
 
     seconds: dict[str, float] = field(default_factory=dict)
+    seen: Seen | None = None
+    """Called after each stage, outside of what is timed."""
+    outer: "Stopwatch | None" = field(default=None, repr=False, compare=False)
+    """The clock of the ``with`` block around this one's: it runs as well."""
 
-    @contextlib.contextmanager
-    def time(self, name: str) -> Iterator[None]:
-        """Add what the block takes to ``name``; a trace shows it, too."""
-        start = time.perf_counter()
-        with trace.stage(name):
-            yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+    def add(self, name: str, seconds: float) -> None:
+        """Add to this clock and to all outer ones."""
+        self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+        if self.outer is not None:
+            self.outer.add(name, seconds)
+
+    def show(self, name: str, result: Any) -> None:
+        """Call ``seen`` of this clock and of all outer ones."""
+        if self.seen is not None:
+            self.seen(name, result)
+        if self.outer is not None:
+            self.outer.show(name, result)
 
     def take(self) -> dict[str, float]:
         """What was measured since the last time."""
@@ -46,45 +72,48 @@ class Stopwatch:
         return taken
 
 
-def watched(model: "Forecaster", seen: Callable[[str, Any], None] = lambda name, result: None) -> Stopwatch:
-    """Put a clock on each stage of ``model``, for good.
-
-    Args:
-        model: is changed: its methods are wrapped.
-        seen: called with each stage's name and result, outside of what is timed.
-
-    Returns:
-        The clock.
-    """
-    watch = Stopwatch()
-    for method, name in STAGES.items():
-        setattr(model, method, _timed(watch, name, getattr(model, method), seen))
-    return watch
+_watch: ContextVar[Stopwatch | None] = ContextVar("vestcl_stopwatch", default=None)
 
 
 @contextlib.contextmanager
-def watching(model: "Forecaster") -> Iterator[Stopwatch]:
-    """`watched` inside the ``with`` block."""
+def watching(seen: Seen | None = None) -> Iterator[Stopwatch]:
+    """Time the stages of all forecasts that this thread makes inside the ``with`` block; other threads do not count.
+
+    Args:
+        seen: called with each stage's name and result, outside of what is timed.
+
+    Returns:
+        The clock, as the ``with`` block's variable.
+    """
+    watch = Stopwatch(seen=seen, outer=_watch.get())
+    token = _watch.set(watch)
     try:
-        yield watched(model)
+        yield watch
     finally:
-        for method in STAGES:
-            vars(model).pop(method, None)
+        _watch.reset(token)
+
+
+def timed(method: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Let a method of STAGES report its time to the thread's `watching`, to `vestcl.trace` and to torch's profiler."""
+    name = STAGES[method.__name__]
+
+    @functools.wraps(method)
+    def stage(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
+        watch, start = _watch.get(), time.perf_counter()
+        try:
+            with trace.stage(name), record_function(name):
+                result = method(*arguments, **named)
+        finally:
+            if watch is not None:
+                watch.add(name, time.perf_counter() - start)
+        if watch is not None:
+            watch.show(name, result)
+        return result
+
+    return stage
 
 
 def with_rest(stages: dict[str, float], whole: float) -> dict[str, float]:
     """All of STAGES in order, 0 s where one did not run, and what is left of ``whole`` as REST."""
     known = {name: stages.get(name, 0.0) for name in STAGES.values()}
     return known | {REST: max(0.0, whole - sum(known.values()))}
-
-
-def _timed(
-    watch: Stopwatch, name: str, method: Callable[..., Any], seen: Callable[[str, Any], None]
-) -> Callable[..., Any]:
-    def timed(*arguments: Any, **named: Any) -> Any:
-        with watch.time(name):
-            result = method(*arguments, **named)
-        seen(name, result)
-        return result
-
-    return timed

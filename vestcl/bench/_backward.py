@@ -22,7 +22,7 @@ class BackwardWatch:
         self._began: list[tuple[float, str]] = []
 
     def seen(self, name: str, result: Any) -> None:
-        """Watch for the gradients of a stage's results; for `vestcl.stages.watched`."""
+        """Watch for the gradients of a stage's results; for `vestcl.stages.watching`."""
         for tensor in tensors_in(result):
             if tensor.requires_grad:
                 tensor.register_hook(lambda _: self._began.append((time.perf_counter(), name)))

@@ -17,7 +17,7 @@ from vestcl.bench._pareto_front import Point, spread
 from vestcl.bench._pareto_knobs import EXACT, Setting
 from vestcl.bench._pareto_scenes import Scene, double, full, shrunk
 from vestcl.bench._timing import Spread
-from vestcl.models._encode import Memory
+from vestcl.models._memory import Memory
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.skipping import NOTHING
 from vestcl.network_input import NetworkInput

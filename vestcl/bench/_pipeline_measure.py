@@ -19,9 +19,9 @@ from vestcl.bench._splatter import counting
 from vestcl.bench._timing import Spread
 from vestcl.bench._traffic import EMPTY, JAM, TRAFFIC, Drive, Window
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.skipping import NOTHING, Count, Skip, Tally
+from vestcl.models.skipping import NOTHING, Count, Skip, count_skips
 from vestcl.scene.layers import build_layers
-from vestcl.stages import watched, with_rest
+from vestcl.stages import watching, with_rest
 
 #: What else is timed beside the variants: the peer, a copy of the frames' layers, and what a new frame needs before.
 PEER, COPY, INPAINT = "DMVFN", "copy", "inpaint"
@@ -111,8 +111,7 @@ class Stepper:
     def __init__(self, model: Forecaster, variant: Variant, drive: Drive) -> None:
         self.variant, self._drive = variant, drive
         self._model = copy.deepcopy(model)  # each variant remembers its own frames
-        self._model.skip, self._model.tally = variant.skip, Tally()
-        self._watch = watched(self._model)
+        self._model.skip = variant.skip
         self._windows = itertools.cycle(enumerate(drive.windows))
         self.stages: list[dict[str, float]] = []
         self.places: list[int] = []
@@ -128,20 +127,19 @@ class Stepper:
         prior = given.prior if self._model.config.start == "prior" else None
         views = [(window.tgt_from_next, given.K)] * (2 if self.variant.twice else 1)
         start = time.perf_counter()
-        with trace.stage(self.variant.name):
+        with trace.stage(self.variant.name), watching() as watch:
             done = self._model.forecast(*window.frames, given.K, 1, views, prior=prior)
-        self.stages.append(with_rest(self._watch.take(), time.perf_counter() - start))
+        self.stages.append(with_rest(watch.seconds, time.perf_counter() - start))
         return done[0].views[0].image
 
     def look(self) -> tuple[list[torch.Tensor], dict[str, Count]]:
         """The images of the steps that count, and what was skipped for them."""
-        images = []
-        self._forecast(self._drive.windows[-1])  # so that it does not matter where the rounds ended
-        for index, window in enumerate(self._drive.windows):
-            if index == self._drive.warm:
-                self._model.tally = Tally()
-            images.append(self._forecast(window))
-        return images[self._drive.warm :], self._model.tally.counts
+        windows, warm = self._drive.windows, self._drive.warm
+        for window in (windows[-1], *windows[:warm]):  # so that it does not matter where the rounds ended
+            self._forecast(window)
+        with count_skips() as tally:
+            images = [self._forecast(window) for window in windows[warm:]]
+        return images, tally.counts
 
     def splatter(self) -> dict[str, Count]:
         """What the splatter left out of the drive's last step."""

@@ -21,7 +21,7 @@ from vestcl.models._layers import joined
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.prior import MotionPrior
 from vestcl.scene.layers import LayerBatch
-from vestcl.stages import watched, with_rest
+from vestcl.stages import watching, with_rest
 
 #: Variant -> networks that are frozen, by their attributes of `Forecaster`. Autograd records nothing that leads to a
 #: frozen one alone, and OpenCL's backward computes no gradient that nobody asks for.
@@ -108,14 +108,13 @@ class Trainer:
         learning = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
         self.parameters = sum(parameter.numel() for parameter in learning)
         self._adam, self._backward = torch.optim.Adam(learning, LEARNING_RATE), BackwardWatch()
-        self._watch = watched(self.model, self._backward.seen)
         self.runs: list[dict[str, dict[str, float]]] = []
 
     def step(self) -> None:
         """Forward, L1, backward, Adam."""
         session, busy = runtime.current(), runtime.current().seconds
         start = time.perf_counter()
-        with trace.stage(FORWARD):
+        with trace.stage(FORWARD), watching(self._backward.seen) as watch:
             loss = self.loss()
         forward = time.perf_counter()
         with trace.stage(BACKWARD):
@@ -124,7 +123,7 @@ class Trainer:
         with trace.stage(ADAM):
             self._adam.step()
         parts = {FORWARD: forward - start, BACKWARD: end - forward, ADAM: time.perf_counter() - end}
-        stages = with_rest(self._watch.take(), parts[FORWARD])
+        stages = with_rest(watch.seconds, parts[FORWARD])
         opencl = {"": session.seconds - busy}
         back = with_rest(backward, parts[BACKWARD])
         self.runs.append({"parts": parts, FORWARD: stages, BACKWARD: back, "opencl": opencl})

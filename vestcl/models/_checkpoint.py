@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from vestcl.io import atomic
+from vestcl.models._weights import check_finite, unwrapped
 from vestcl.models.config import ModelConfig
 
 #: The metadata's entry that holds the configuration.
@@ -31,11 +32,12 @@ def write_checkpoint(path: Path | str, config: ModelConfig, state: Mapping[str, 
 
 
 def read_checkpoint(path: Path | str) -> tuple[ModelConfig, dict[str, torch.Tensor]]:
-    """What `write_checkpoint` wrote; runs no code from the file.
+    """What `write_checkpoint` wrote, names as of `unwrapped`; runs no code from the file.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: damaged, no safetensors file, or without a configuration that this version knows.
+        ValueError: damaged, no safetensors file, without a configuration that this version knows, or with weights
+            that are not finite.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"no model at {path}")
@@ -47,9 +49,11 @@ def read_checkpoint(path: Path | str) -> tuple[ModelConfig, dict[str, torch.Tens
         raise ValueError(f"`path` must be a safetensors file, got {path} ({error})") from error
     if KEY not in metadata:
         raise ValueError(f"`path` must hold a configuration (`Forecaster.save` writes one), got none in {path}")
+    state = unwrapped(state, path)
+    check_finite(state, path)
     try:
         return _built(ModelConfig, json.loads(metadata[KEY])), state
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"`path` must hold a configuration of this version, got {path} ({error})") from error
 
 

@@ -1,9 +1,6 @@
 """Frames through the encoder: each once, and backgrounds where they differ from their frame."""
 
-from collections import deque
-
 import torch
-from torch import nn
 from torch.nn import functional
 
 from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
@@ -12,42 +9,6 @@ from vestcl.models.config import EncoderConfig
 from vestcl.models.encoder import COARSEST, STRIDE, Encoder, reach, upsample_features
 from vestcl.models.skipping import Box, Skip, Tally, boxes
 from vestcl.scene.layers import LayerBatch
-
-#: Frames that are remembered: the next step's two inputs.
-_REMEMBERED = 2
-
-#: Every so many rows and columns are compared before all are.
-_SOME = 16
-
-
-class Memory:
-    """The last frames that were encoded, for when they come again: as long as weights and settings stay the same."""
-
-    def __init__(self) -> None:
-        self._frames: deque[tuple[object, LayerBatch, EncodedFrame]] = deque(maxlen=_REMEMBERED)
-
-    def copy(self) -> "Memory":
-        """One that remembers the same, and forgets by itself."""
-        other = Memory()
-        other._frames.extend(self._frames)
-        return other
-
-    def find(self, key: object, layers: LayerBatch) -> EncodedFrame | None:
-        """What ``layers`` were encoded to, if they are among the last."""
-        for known, seen, encoded in self._frames:
-            if known == key and all(map(_same, seen, layers)):
-                return encoded
-        return None
-
-    def keep(self, key: object, layers: LayerBatch, encoded: EncodedFrame) -> None:
-        """In place of the oldest."""
-        self._frames.append((key, layers, encoded))
-
-
-def version(*networks: nn.Module | None) -> tuple[int, ...] | None:
-    """Differs after every change of the weights; None where that can't be told."""
-    parameters = [parameter for network in networks if network is not None for parameter in network.parameters()]
-    return None if any(p.is_inference() for p in parameters) else tuple(p._version for p in parameters)
 
 
 def encode(encoder: Encoder, config: EncoderConfig, layers: LayerBatch, skip: Skip, tally: Tally) -> EncodedFrame:
@@ -111,10 +72,3 @@ def _borrowing(
 
 def _pixels(layers: LayerBatch, frames: int) -> int:
     return frames * layers.image.shape[2] * layers.image.shape[3]
-
-
-def _same(one: torch.Tensor, other: torch.Tensor) -> bool:
-    if one is other:
-        return True
-    some = one[..., ::_SOME, ::_SOME], other[..., ::_SOME, ::_SOME]  # of two frames a few pixels tell that
-    return one.dtype == other.dtype and torch.equal(*some) and torch.equal(one, other)

@@ -8,9 +8,10 @@ from torch import nn
 
 from vestcl import geometry
 from vestcl.models._clouds import Cloud, as_image, join, lift, lift_hidden
-from vestcl.models._encode import Memory, encode, version
+from vestcl.models._encode import encode
 from vestcl.models._frames import EncodedFrame, grid_depth, grid_mean, with_depth
 from vestcl.models._layers import side_by_side
+from vestcl.models._memory import Memory, State
 from vestcl.models._motion import INTERVALS, Motion
 from vestcl.models._objects import move_objects, unmoved
 from vestcl.models._render import (
@@ -30,10 +31,11 @@ from vestcl.models.encoder import Encoder
 from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
 from vestcl.models.prior import MotionPrior, beside
 from vestcl.models.refine import Refine
-from vestcl.models.skipping import Skip, Tally
+from vestcl.models.skipping import Skip, current_tally
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
 from vestcl.scene.layers import LayerBatch
+from vestcl.stages import timed
 
 
 class Stages(nn.Module):
@@ -53,13 +55,14 @@ class Stages(nn.Module):
         #: Encoder and refinement compute in this type (torch.bfloat16, or None for the parameters' own): motion, which
         #: is millimetres in hundreds of metres, never does.
         self.autocast: torch.dtype | None = None
-        #: What is not computed where a scene does not need it, and how much that has been so far.
-        self.skip, self.tally = Skip(), Tally()
+        #: What is not computed where a scene does not need it; `vestcl.models.skipping.count_skips` counts it.
+        self.skip = Skip()
         #: What is computed more coarsely than the network was trained to.
         self.effort = Effort()
         #: The frames that were encoded last.
         self.memory = Memory()
 
+    @timed
     def encode(self, frame: LayerBatch) -> EncodedFrame:
         """Features of a frame and of its background, in one pass, and what EMF sees in it; backgrounds without
         foreground in front are the frame itself.
@@ -71,19 +74,19 @@ class Stages(nn.Module):
             Features [B, C, H, W], and depths replaced where the configuration fixes them.
         """
         layers = with_depth(frame, self.config.fixed_depth)
-        key = None if torch.is_grad_enabled() else self._encoding()
-        known = None if key is None else self.memory.find(key, frame)
-        if key is not None:
-            self.tally.add("seen", len(frame.image) * (known is not None), len(frame.image), "frames")
-        if known is not None:
-            return known
+        tally, state = current_tally(), self._state()
+        if state is not None:
+            known = self.memory.find(state, frame)
+            tally.add("seen", len(frame.image) * (known is not None), len(frame.image), "frames")
+            if known is not None:
+                return known._replace(layers=layers)
         with self._autocast():
-            encoded = encode(self.encoder, self.config.encoder, layers, self.skip, self.tally)
+            encoded = encode(self.encoder, self.config.encoder, layers, self.skip, tally)
         if self.ego_motion is not None:
             depth, mask = grid_depth(layers.background_depth), grid_mean(layers.mask)
             encoded = encoded._replace(camera_grid=self.ego_motion.look(encoded.background_grid, depth, mask))
-        if key is not None:
-            self.memory.keep(key, frame, encoded)
+        if state is not None:
+            self.memory.keep(state, frame, encoded)
         return encoded
 
     def move(self, prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, prior: MotionPrior | None = None) -> Motion:
@@ -105,6 +108,7 @@ class Stages(nn.Module):
         start = flow0 if prior is None or self.object_motion is None else flow0 + beside(prior, to_next[:2])
         return Motion(*to_next, points, flow0, start, self.move_objects(prev, cur, to_next, flow0, start))
 
+    @timed
     def move_camera(self, prev: EncodedFrame, cur: EncodedFrame, prior: MotionPrior | None = None) -> CameraMotion:
         """EMF on the encoder's grid: the camera's motion; rest where the model has no EMF."""
         if self.ego_motion is None or prev.camera_grid is None or cur.camera_grid is None:
@@ -113,6 +117,7 @@ class Stages(nn.Module):
         known = None if prior is None else (prior.next_from_cur, prior.cur_from_prev, prior.prev_from_before)
         return self.ego_motion.decide(prev.camera_grid, cur.camera_grid, mask_prev, mask_cur, known)
 
+    @timed
     def move_objects(
         self,
         prev: EncodedFrame,
@@ -125,9 +130,10 @@ class Stages(nn.Module):
         if self.object_motion is None or self.object_motion.changes_nothing:
             return unmoved(start)
         return move_objects(
-            self.object_motion, prev, cur, to_next, flow0, start, self.skip, self.tally, self.effort.blocks
+            self.object_motion, prev, cur, to_next, flow0, start, self.skip, current_tally(), self.effort.blocks
         )
 
+    @timed
     def lift(self, prev: EncodedFrame, cur: EncodedFrame, motion: Motion, K: torch.Tensor) -> list[Cloud]:
         """Both frames' layers as clouds on their way to t + 1; with `RenderConfig.joint` as one.
 
@@ -167,6 +173,7 @@ class Stages(nn.Module):
         sides = self.splat(clouds, camera, motion, K)
         return compose_view(sides, self.paint(sides))
 
+    @timed
     def splat(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> list[Side]:
         """What each cloud leaves on the view, of the frames' size; arguments as in `show`."""
         height, width = motion.flow0.shape[2:]
@@ -176,6 +183,7 @@ class Stages(nn.Module):
         sides = self._splat(clouds, camera, motion, K, size)
         return [Side(*(enlarged(plane, height, width) for plane in side)) for side in sides]
 
+    @timed
     def paint(self, sides: Sequence[Side]) -> torch.Tensor:
         """The refined image [B, 3, H, W], from the channels that `RenderConfig.channels` counts.
 
@@ -206,13 +214,17 @@ class Stages(nn.Module):
         front = splat_cloud(cur, *known)
         uncovered = front.coverage.detach() < OPAQUE
         deep = inner_holes(uncovered) if self.config.render.inpainted == "inner" else None
-        behind = splat_cloud(prev, *known, uncovered, self.tally if self.skip.covered else None, deep)
+        behind = splat_cloud(prev, *known, uncovered, current_tally() if self.skip.covered else None, deep)
         return [Side(*(plane * uncovered for plane in behind)), front]
 
-    def _encoding(self) -> object:
-        """What features depend on beside the frame; None where they are not remembered."""
-        known = version(self.encoder, self.ego_motion) if self.skip.seen else None
-        return known and (known, self.skip, self.autocast)
+    def _state(self) -> State | None:
+        """What features depend on besides the frame; None where they are not remembered."""
+        if torch.is_grad_enabled() or not self.skip.seen:
+            return None
+        networks = [network for network in (self.encoder, self.ego_motion) if network is not None]
+        weights = [weight for network in networks for weight in (*network.parameters(), *network.buffers())]
+        around = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else None
+        return self.memory.state((self.config, self.skip, self.autocast, around), weights)
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast("cpu", self.autocast, enabled=self.autocast is not None)

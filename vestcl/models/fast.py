@@ -9,14 +9,14 @@ and a process that keeps the memory that it frees is spared its page faults.
 import ctypes
 import inspect
 import platform
-import weakref
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Literal, NamedTuple, get_args
+from typing import Any, Final, Literal, get_args
 
 import torch
 from torch.nn import functional
 
 from vestcl.models._layers import tensors_in
+from vestcl.models._weights import unwrapped
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.object_motion import (
     MOTION_CHANNELS,
@@ -91,7 +91,7 @@ class FastForecaster(Forecaster):
 
     def __init__(self, model: Forecaster, precision: Precision) -> None:
         super().__init__(model.config)
-        self.load_state_dict(model.state_dict())
+        self.load_state_dict(unwrapped(model.state_dict(), model.config.name))
         self.skip, self.effort = model.skip, model.effort
         self.autocast = torch.bfloat16 if precision == "bfloat16" else None
         if self.object_motion is not None:
@@ -158,8 +158,7 @@ def share_frames(network: ObjectMotion, blocks: int | None = None) -> bool:
     blocks. Few channels out of many are what convolutions are worst at, and each reads all of the frames.
 
     Args:
-        network: object motion of shape "dmvfn" without routing; its weights may be changed by `load_state_dict` alone
-            from now on.
+        network: object motion of shape "dmvfn" without routing. Its weights may change at any time.
         blocks: the first so many share, as more are not going to run (see `Effort.blocks`); None is all.
 
     Returns:
@@ -179,51 +178,51 @@ def share_frames(network: ObjectMotion, blocks: int | None = None) -> bool:
         for block, name in places:
             setattr(block, name, SharedMotionConv(getattr(block, name), joint, start))
             start += getattr(block, name).out_channels
+    network.shared, network.sharing = SharedFrames, len(network.blocks[:blocks])
     return True
 
 
-class _Looked(NamedTuple):
-    frames: weakref.ref[torch.Tensor]
-    result: torch.Tensor
+class SharedFrames:
+    """Both frames' channels at one scale, in one forecast: a `JointConv` over them runs once.
+
+    Args:
+        frames: [B, frames, H, W]; they stay as they are while this object is used.
+    """
+
+    def __init__(self, frames: torch.Tensor) -> None:
+        self._frames = frames
+        self._results: dict[JointConv, torch.Tensor] = {}
+
+    def through(self, joint: "JointConv") -> torch.Tensor:
+        """``joint`` of the frames."""
+        if joint not in self._results:
+            self._results[joint] = joint(self._frames)
+        return self._results[joint]
 
 
 class JointConv:
-    """The part over the frames of several `MotionConv`, as one convolution that runs once for the same frames.
+    """The part over the frames of several `MotionConv`, as one convolution.
 
     Args:
-        convs: of one stride.
+        convs: of one stride. A `SharedMotionConv` of each takes its place.
     """
 
     def __init__(self, convs: Sequence[MotionConv]) -> None:
-        self._convs = tuple(convs)
-        self._weights: tuple[torch.Tensor, torch.Tensor] | None = None
-        self._looked: _Looked | None = None
-
-    def forget(self) -> None:
-        """The convolutions' weights have changed."""
-        self._weights = self._looked = None
+        self.convs = list(convs)
 
     def __call__(self, frames: torch.Tensor) -> torch.Tensor:
         """[B, frames, H, W] -> [B, channels of all, ceil(H / stride), ceil(W / stride)]."""
-        looked = self._looked
-        if looked is None or looked.frames() is not frames:
-            conv, (weight, bias) = self._convs[0], self._weights or self._joined()
-            result = functional.conv2d(frames, weight, bias, conv.stride, conv.padding)
-            looked = self._looked = _Looked(weakref.ref(frames), result)
-        return looked.result
-
-    def _joined(self) -> tuple[torch.Tensor, torch.Tensor]:
-        weights = torch.cat([conv.weight.detach()[:, :-MOTION_CHANNELS] for conv in self._convs])
-        biases = torch.cat([conv.bias.detach() for conv in self._convs if conv.bias is not None])
-        self._weights = weights, biases
-        return self._weights
+        conv = self.convs[0]
+        weight = torch.cat([one.weight.detach()[:, :-MOTION_CHANNELS] for one in self.convs])
+        bias = torch.cat([one.bias.detach() for one in self.convs if one.bias is not None])
+        return functional.conv2d(frames, weight, bias, conv.stride, conv.padding)
 
 
 class SharedMotionConv(MotionConv):
-    """`MotionConv` whose part over the frames is ``joint``'s.
+    """`MotionConv` whose part over `SharedFrames` is ``joint``'s; over a tensor it is a plain `MotionConv`.
 
     Args:
-        conv: whose weights it has.
+        conv: whose weights it has, and whose place in ``joint`` it takes.
         joint: that ``conv`` is a part of.
         start: its first channel there.
     """
@@ -232,12 +231,11 @@ class SharedMotionConv(MotionConv):
         super().__init__(conv.in_channels - MOTION_CHANNELS, conv.out_channels, conv.stride[0])
         self.weight, self.bias = conv.weight, conv.bias
         self._joint, self._channels = joint, slice(start, start + conv.out_channels)
+        joint.convs = [self if one is conv else one for one in joint.convs]
 
-    def forward(self, frames: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+    def forward(self, frames: torch.Tensor | SharedFrames, flow: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
         """As `MotionConv.forward`."""
+        if isinstance(frames, torch.Tensor):
+            return super().forward(frames, flow)
         of_flow = functional.conv2d(flow, self.weight[:, -MOTION_CHANNELS:], None, self.stride, self.padding)
-        return of_flow + self._joint(frames)[:, self._channels]
-
-    def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
-        super()._load_from_state_dict(*arguments, **named)
-        self._joint.forget()
+        return of_flow + frames.through(self._joint)[:, self._channels]

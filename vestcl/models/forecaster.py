@@ -13,7 +13,9 @@ from vestcl.models._motion import Motion, Step, arrived, next_prior
 from vestcl.models._perceive import Perceive, known_view, perceive_forecast, perceive_view
 from vestcl.models._render import Camera, RenderedView, checked_camera
 from vestcl.models._stages import Stages
+from vestcl.models._weights import misfit
 from vestcl.models.prior import MotionPrior, check_prior
+from vestcl.models.skipping import current_tally
 from vestcl.scene.layers import LayerBatch
 
 __all__ = ["Camera", "Forecaster", "Mode", "Motion", "Perceive", "RenderedView", "Step", "perceive_forecast"]
@@ -149,7 +151,7 @@ class Forecaster(Stages):
         views: list[RenderedView] = []
         for camera in cameras:
             known = known_view(cameras[: len(views)], views, camera) if self.skip.views else None
-            self.tally.add("views", known is not None, 1, "views")
+            current_tally().add("views", known is not None, 1, "views")
             views.append(known or self.show(clouds, camera, motion, K))
         return views
 
@@ -180,12 +182,11 @@ class Forecaster(Stages):
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: a damaged file, one without a configuration, or weights that don't fit it.
+            ValueError: a damaged file, one without a configuration, or weights that don't fit it or are not finite.
         """
         config, state = read_checkpoint(path)
         model = cls(config)
-        try:
-            model.load_state_dict(state)
-        except RuntimeError as error:
-            raise ValueError(f"`path` must hold the weights of {config.name}, got {path} ({error})") from error
+        if reason := misfit(state, model.state_dict()):
+            raise ValueError(f"`path` must hold the weights of {config.name}, got {path}, which {reason}")
+        model.load_state_dict(state)
         return model.eval()

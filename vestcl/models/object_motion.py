@@ -1,6 +1,7 @@
 """Object-motion forecasting (OMF): how every point moves to the next frame, as a correction of the rigid flow."""
 
 import math
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 import torch
@@ -55,6 +56,9 @@ class ObjectMotion(nn.Module):
         )
         self.routing = None if config.routing is None else Routing(frames, len(config.scales), config.routing)
         self.multiple = math.lcm(*config.scales) * (_DMVFN_STRIDE if config.shape == "dmvfn" else 1)
+        #: What blocks get in place of the frames, at each scale, and how many of them: `vestcl.models.fast` sets both.
+        self.shared: Callable[[torch.Tensor], Any] | None = None
+        self.sharing = 0
 
     def forward(
         self,
@@ -132,9 +136,12 @@ class ObjectMotion(nn.Module):
     ) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """All blocks in turn; outside training, each for the samples that chose it."""
         candidates = []
-        for block, scale, gate in zip(self.blocks, self.scales, gates.unbind(1), strict=False):
+        plain = {1: frames} | shrunk
+        shared = plain if self.shared is None else {scale: self.shared(tensor) for scale, tensor in plain.items()}
+        for index, (block, scale, gate) in enumerate(zip(self.blocks, self.scales, gates.unbind(1), strict=False)):
             if self.training or self.routing is None:
-                residual = block(frames, shrunk[scale], flow)
+                looked_at = shared if index < self.sharing else plain
+                residual = block(looked_at[1], looked_at[scale], flow)
                 candidates.append(flow + residual)
                 flow = candidates[-1] if self.routing is None else flow + gate[:, None, None, None] * residual
                 continue

@@ -1,5 +1,8 @@
 """What a scene does not need, and so is not computed: the switches, and what they saved."""
 
+import contextlib
+from collections.abc import Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -57,14 +60,41 @@ class Count(NamedTuple):
 
 @dataclass
 class Tally:
-    """What was skipped, by switch, summed up over the forecasts of a model."""
+    """What was skipped, by switch, summed up over the forecasts of a `count_skips` block."""
 
     counts: dict[str, Count] = field(default_factory=dict)
+    outer: "Tally | None" = field(default=None, repr=False, compare=False)
+    """The tally of the ``with`` block around this one's: it counts as well."""
 
     def add(self, switch: str, skipped: int, of: int, unit: str) -> None:
-        """``skipped`` of ``of`` more."""
+        """``skipped`` of ``of`` more, here and in all outer tallies."""
         before = self.counts.get(switch, Count(0, 0, unit))
         self.counts[switch] = Count(before.skipped + int(skipped), before.of + int(of), unit)
+        if self.outer is not None:
+            self.outer.add(switch, skipped, of, unit)
+
+
+_tally: ContextVar[Tally | None] = ContextVar("vestcl_tally", default=None)
+
+
+@contextlib.contextmanager
+def count_skips() -> Iterator[Tally]:
+    """Count what the forecasts skip that this thread makes inside the ``with`` block; other threads do not count.
+
+    Returns:
+        The tally, as the ``with`` block's variable.
+    """
+    tally = Tally(outer=_tally.get())
+    token = _tally.set(tally)
+    try:
+        yield tally
+    finally:
+        _tally.reset(token)
+
+
+def current_tally() -> Tally:
+    """The tally of the thread's `count_skips`; outside of one, a tally that nobody reads."""
+    return _tally.get() or Tally()
 
 
 class Box(NamedTuple):
