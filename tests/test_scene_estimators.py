@@ -195,6 +195,15 @@ def drop_a_weight(folder: Path) -> None:
     save_file(weights, folder / "model.safetensors", {"format": "pt"})
 
 
+def spoil_a_weight(number: float) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        weights = load_file(folder / "model.safetensors")
+        weights["decode_head.classifier.weight"][3] = number
+        save_file(weights, folder / "model.safetensors", {"format": "pt"})
+
+    return spoil
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -208,6 +217,8 @@ def drop_a_weight(folder: Path) -> None:
         (lambda folder: (folder / "model.safetensors").unlink(), "no checkpoint that transformers can load"),
         (lambda folder: (folder / "model.safetensors").write_bytes(b"12345"), "no checkpoint that transformers can"),
         (drop_a_weight, "must have every parameter, got none for decode_head.classifier.weight"),
+        (spoil_a_weight(np.nan), "weights must be finite, got NaN or infinity in decode_head.classifier.weight"),
+        (spoil_a_weight(-np.inf), "weights must be finite, got NaN or infinity in decode_head.classifier.weight"),
     ],
 )
 def test_damaged_checkpoints(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from vestcl.models._layers import check
-from vestcl.models._weights import read_state_dict
+from vestcl.models._weights import check_finite, read_state_dict
 from vestcl.models.trunks import Normalisation, Trunk, load_trunk
 
 #: LPIPS's own scaling layer, after 2 x - 1: ImageNet's mean and deviation on [-1, 1], in three digits.
@@ -179,5 +179,6 @@ def _read_heads(name: str, path: Path, channels: Sequence[int]) -> list[torch.Te
         if key not in state or list(state[key].shape) != [1, size, 1, 1]:
             got = list(state[key].shape) if key in state else "nothing"
             raise ValueError(f"`heads_path` must hold {key} [1, {size}, 1, 1], got {got} in {path}: {remedy}")
+        check_finite({key: state[key]}, path, "heads_path", f": {remedy}")
         heads.append(state[key].flatten().float())
     return heads

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from vestcl.models._layers import channels_last, check, group_norm, side_by_side, upsample
 from vestcl.models._norm import Normalise, own
-from vestcl.models._weights import read_state_dict
+from vestcl.models._weights import check_finite, read_state_dict, some_of
 from vestcl.models.config import ENCODER_GROUP, EncoderConfig
 
 #: Pixels of the image a cell of the features, in both directions.
@@ -22,9 +22,6 @@ COARSEST: Final = 16
 #: Mean and standard deviation of ImageNet's images (RGB in [0, 1]), which its networks expect at 0 and 1.
 IMAGENET_MEAN: Final = (0.485, 0.456, 0.406)
 IMAGENET_STD: Final = (0.229, 0.224, 0.225)
-
-#: Names that an error lists before it says how many there are.
-_NAMES_SHOWN: Final = 3
 
 
 class Encoder(nn.Module):
@@ -158,15 +155,16 @@ def load_resnet34(encoder: Encoder, path: Path | str) -> None:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: the file is damaged, lacks weights or has some of other shapes.
+        ValueError: the file is damaged, lacks weights, or has some of other shapes or some that are not finite.
     """
     state = read_state_dict(path)
     wanted = {_resnet_name(name): parameter for name, parameter in _trunk(encoder)}
     if missing := [name for name in wanted if name not in state]:
-        raise ValueError(f"`path` must hold ResNet34's weights; {path} lacks {_some(missing)}")
+        raise ValueError(f"`path` must hold ResNet34's weights; {path} lacks {some_of(missing)}")
     shapes = {name: (list(parameter.shape), list(state[name].shape)) for name, parameter in wanted.items()}
     if wrong := [f"{name} {want}, got {got}" for name, (want, got) in shapes.items() if want != got]:
-        raise ValueError(f"`path` must hold weights of the encoder's shapes; {path}: wanted {_some(wrong)}")
+        raise ValueError(f"`path` must hold weights of the encoder's shapes; {path}: wanted {some_of(wrong)}")
+    check_finite({name: state[name] for name in wanted}, path)
     with torch.no_grad():
         for name, parameter in wanted.items():
             parameter.copy_(state[name])
@@ -194,8 +192,3 @@ def _trunk(encoder: Encoder) -> Iterator[tuple[str, nn.Parameter]]:
 
 def _resnet_name(name: str) -> str:
     return name.replace("norm", "bn")
-
-
-def _some(names: list[str]) -> str:
-    rest = len(names) - _NAMES_SHOWN
-    return "; ".join(names[:_NAMES_SHOWN]) + (f"; and {rest} more" if rest > 0 else "")

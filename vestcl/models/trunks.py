@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from vestcl.models._layers import check
-from vestcl.models._weights import read_state_dict
+from vestcl.models._weights import check_finite, read_state_dict, unwrapped
 
 
 class Normalisation(NamedTuple):
@@ -159,7 +159,7 @@ def load_trunk(name: str, path: Path | str, normalisation: Normalisation | None 
 
     Raises:
         FileNotFoundError: no such file; the message says how to make it.
-        ValueError: another name, a damaged file, weights that are missing or of another shape.
+        ValueError: another name, a damaged file, weights that are missing, of another shape, or not finite.
     """
     path = Path(path)
     is_caffe = path.suffix == ".npz"
@@ -173,7 +173,9 @@ def load_trunk(name: str, path: Path | str, normalisation: Normalisation | None 
     if wrong := [key for key, shape in wanted.items() if state[key].shape != shape]:
         key, want, got = wrong[0], list(wanted[wrong[0]]), list(state[wrong[0]].shape)
         raise ValueError(f"`path` must hold {name}'s weights; in {path} {key} is {got} and not {want}: {_remedy(name)}")
-    trunk.load_state_dict({key: state[key] for key in wanted})
+    weights = {key: state[key] for key in wanted}
+    check_finite(weights, path, remedy=f": {_remedy(name)}")
+    trunk.load_state_dict(weights)
     return trunk.requires_grad_(False).eval()
 
 
@@ -232,6 +234,7 @@ def _read_caffe(path: Path) -> dict[str, torch.Tensor]:
             state: dict[str, Any] = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
     except (AttributeError, EOFError, OSError, TypeError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"`path` must be an .npz file of weights, got {path} ({error})") from error
+    state = unwrapped(state, path)
     modules = [str(i) for i, layer in enumerate(_squeezenet()) if isinstance(layer, Fire)]
     names = {"conv1": "0"}
     for fire, index in enumerate(modules, start=2):

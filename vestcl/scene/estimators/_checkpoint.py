@@ -71,8 +71,8 @@ class Checkpoint:
             device: of torch, "cpu" or "cuda".
 
         Raises:
-            ValueError: no weights, damaged ones, or weights that lack a parameter; transformers would start that one
-                at random and only warn.
+            ValueError: no weights, damaged ones, weights that are not finite, or weights that lack a parameter;
+                transformers would start that one at random and only warn.
         """
         network = getattr(_transformers(), self.network)
         with _explained(self.name):
@@ -82,7 +82,11 @@ class Checkpoint:
         missing = sorted(set(info["missing_keys"]) & {name for name, _ in model.named_parameters()})
         if missing:
             raise ValueError(f"{self.name}: weights must have every parameter, got none for {_first(missing)}")
-        return model.float().eval().requires_grad_(False).to(device)
+        model = model.float()
+        broken = [name for name, weight in model.state_dict().items() if not weight.isfinite().all()]
+        if broken:
+            raise ValueError(f"{self.name}: weights must be finite, got NaN or infinity in {_first(broken)}")
+        return model.eval().requires_grad_(False).to(device)
 
 
 def _transformers() -> Any:
