@@ -32,6 +32,21 @@ def sample(**changes: object) -> Sample:
     return dataclasses.replace(made, **changes)
 
 
+def test_arrays_are_copied() -> None:
+    """A caller may fill its buffers again, and a reader may write to what it reads."""
+    image, depth, ids = np.zeros((3, 6, 8), np.float32), np.ones((1, 6, 8), np.float32), np.ones((1, 6, 8), np.uint8)
+    camera = K.copy()
+    made = Sample.from_arrays("0", image, camera, depth=depth, train_ids=ids)
+    for array in (image, depth, ids, camera):
+        array[...] = 7
+    for read in (made.read_image, made.read_depth, made.read_labels):
+        wanted = read().copy()
+        assert wanted.max() < 7
+        read()[...] = 5
+        assert np.array_equal(read(), wanted)
+    assert np.array_equal(made.K, K)
+
+
 def test_arrays_come_back() -> None:
     made = sample()
     assert (made.height, made.width, made.timestamp) == (6, 8, 0.7)

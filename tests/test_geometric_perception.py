@@ -3,6 +3,7 @@
 import itertools
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -155,6 +156,47 @@ def test_everything_is_computed_once() -> None:
     assert Counter(stages) == {"layers": 1, "mask": 1, "depth": 2, "flow": 1, "read": 2, "ego-motion": 1}
     perception.seen(FRAME + 1)
     assert counts[f"image {FRAME}"] == counts[f"depth {FRAME}"] == 1
+
+
+@dataclass(frozen=True)
+class OneBuffer:
+    """A source that reads into the same array as all others, as a camera's driver may."""
+
+    source: Any
+    buffer: np.ndarray
+
+    @property
+    def height(self) -> int:
+        return self.source.height
+
+    @property
+    def width(self) -> int:
+        return self.source.width
+
+    def read(self) -> Any:
+        np.copyto(self.buffer, self.source.read())
+        return self.buffer
+
+
+def test_sources_may_read_into_one_buffer() -> None:
+    clip = drive(4).clip
+    image, depth = np.zeros((3, HEIGHT, WIDTH), np.float32), np.zeros((1, HEIGHT, WIDTH), np.float32)
+    samples = (replace(s, image=OneBuffer(s.image, image), depth=OneBuffer(s.depth, depth)) for s in clip)
+    shared, own = Perception(replace(clip, samples=tuple(samples))), Perception(clip)
+    for index in (FRAME - 1, FRAME):
+        got, wanted = shared.seen(index).layers, own.seen(index).layers
+        for name in ("image", "depth", "mask", "background_image", "background_depth"):
+            assert np.array_equal(getattr(got, name), getattr(wanted, name))
+        assert np.array_equal(shared.prev_from_cur(index), own.prev_from_cur(index))
+
+
+def test_threads_share_what_is_computed_once() -> None:
+    counts: Counter[str] = Counter()
+    perception = Perception(counted(drive(4).clip, counts, "image", "depth"))
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(perception.seen, [FRAME, FRAME + 1] * 4))
+    assert all(one is found[index % 2] for index, one in enumerate(found))
+    assert set(counts.values()) == {1}
 
 
 def test_old_frames_are_forgotten_and_recent_ones_are_not() -> None:

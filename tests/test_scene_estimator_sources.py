@@ -95,6 +95,18 @@ def test_the_least_recently_read_is_forgotten_first() -> None:
     assert len(depth.seen) == KEPT + 2
 
 
+def test_an_estimator_may_fill_one_array_again_and_again() -> None:
+    buffer = np.zeros((1, 8, 16), np.float32)
+
+    def depth(image: Image) -> Image:
+        np.copyto(buffer, 1 + image[:1])
+        return buffer
+
+    estimated = with_estimates(clip(4), depth)
+    for frame in (1, 3, 1, 3):
+        np.testing.assert_array_equal(estimated[frame].read_depth(), np.float32(1 + frame / 4))
+
+
 def test_a_readers_changes_are_its_own() -> None:
     sample = with_estimates(clip(), Counted())[0]
     assert sample.depth is not None

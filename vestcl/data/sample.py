@@ -106,7 +106,7 @@ class Sample:
         world_from_cam: ArrayLike | None = None,
         timestamp: float | None = None,
     ) -> "Sample":
-        """A sample of arrays at hand.
+        """A sample of arrays at hand, which are copied.
 
         Args:
             name: of the frame.
@@ -271,7 +271,7 @@ def _scaled(K: NDArray[np.float64], sx: float, sy: float) -> NDArray[np.float64]
 
 
 def _planes(name: str, value: ArrayLike, dtype: type[np.generic], channels: int) -> NDArray[Any]:
-    planes = np.asarray(value).astype(dtype, copy=False)
+    planes = np.asarray(value).astype(dtype)  # a copy, also of the same dtype
     if planes.ndim != 3 or len(planes) != channels or not planes.size:
         raise ValueError(f"`{name}` must be [{channels}, H, W], got {list(planes.shape)}")
     return planes

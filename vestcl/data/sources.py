@@ -114,8 +114,8 @@ class ImageArray:
         return self.image.shape[2]
 
     def read(self) -> NDArray[np.float32]:
-        """The picture."""
-        return self.image
+        """A copy of the picture."""
+        return self.image.copy()
 
 
 @dataclass(frozen=True)
@@ -162,8 +162,8 @@ class DepthArray:
     """[1, H, W] m, valid iff > 0."""
 
     def read(self) -> NDArray[np.float32]:
-        """The depth map."""
-        return self.depth
+        """A copy of the depth map."""
+        return self.depth.copy()
 
 
 @dataclass(frozen=True)
@@ -190,8 +190,8 @@ class LabelArray:
     """[1, H, W] Cityscapes train ids, 255 = void."""
 
     def read(self) -> NDArray[np.uint8]:
-        """The classes."""
-        return self.train_ids
+        """A copy of the classes."""
+        return self.train_ids.copy()
 
 
 @dataclass(frozen=True)

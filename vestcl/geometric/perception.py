@@ -1,6 +1,7 @@
 """What can be known of a clip's frames without a network: depth, own motion, masks, layers, things. Kept by frame."""
 
 import math
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -54,6 +55,9 @@ class Seen:
 class Perception:
     """Results for the frames of a clip: computed when asked for, kept while later frames need them.
 
+    What the clip's sources give is copied, so they may fill one buffer again and again. Threads may share a
+    `Perception`; one computes at a time.
+
     ``seconds`` tells the time by stage. Depth comes from the clip (scans are densified), else from its stereo pair,
     else from motion; masks from labels, else from motion.
     """
@@ -64,10 +68,11 @@ class Perception:
         self._progress = progress
         self._kept: dict[tuple[str, int], Any] = {}
         self._inner = 0.0
+        self._lock = threading.RLock()
 
     def image(self, index: int) -> NDArray[np.float32]:
         """[3, H, W]."""
-        return self._once("read", index, lambda: self.clip[index].read_image())
+        return self._once("read", index, lambda: self.clip[index].read_image().copy())
 
     def correspondence(self, index: int) -> Correspondence:
         """From frame ``index`` to the one before."""
@@ -100,22 +105,29 @@ class Perception:
 
     def _once(self, stage: str, index: int, compute: Callable[[], Result]) -> Result:
         key = (stage, index)
-        if key not in self._kept:
-            if self._progress:
-                self._progress(stage)
-            outer, self._inner, start = self._inner, 0.0, time.perf_counter()
-            self._kept[key] = compute()
+        with self._lock:
+            if key not in self._kept:
+                if self._progress:
+                    self._progress(stage)
+                self._kept[key] = self._timed(stage, compute)
+                for old in [kept for kept in self._kept if not index - _KEPT < kept[1] <= index + _KEPT]:
+                    del self._kept[old]
+            return self._kept[key]
+
+    def _timed(self, stage: str, compute: Callable[[], Result]) -> Result:
+        """``compute``'s result; its time counts as the stage's, but for the stages that ran inside."""
+        outer, self._inner, start = self._inner, 0.0, time.perf_counter()
+        try:
+            return compute()
+        finally:
             taken = time.perf_counter() - start
             self.seconds[stage] = self.seconds.get(stage, 0.0) + taken - self._inner
             self._inner = outer + taken
-            for old in [kept for kept in self._kept if not index - _KEPT < kept[1] <= index + _KEPT]:
-                del self._kept[old]
-        return self._kept[key]
 
     def _depth(self, index: int) -> NDArray[np.float32]:
         sample = self.clip[index]
         if sample.depth is not None:
-            depth = sample.read_depth()
+            depth = sample.read_depth().copy()
             return depth if (depth > 0).mean() >= _DENSE else densify(depth, self.image(index), sky=self._sky(index))
         if sample.right is None:
             return self._from_motion(index).depth
@@ -162,7 +174,7 @@ class Perception:
 
     def _see(self, index: int) -> Seen:
         sample, mask, depth = self.clip[index], self.mask(index), self.raw_depth(index)
-        own = sample.read_ego_vehicle()
+        own = sample.read_ego_vehicle().copy()
         if index > 0 and not self._is_monocular(index):
             view = View(self.correspondence(index), self.prev_from_cur(index))
             depth = refine_depth(depth, self.inverse_std(index), sample.K, [view], mask & ~own)

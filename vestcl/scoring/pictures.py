@@ -117,7 +117,7 @@ class Truth:
             camera = seen_by(view, self.clip[index])
             if camera is None:
                 raise ValueError(f"{self.clip.name}: frame {self.clip[index].name} has no picture from {view.name}")
-            self._full[key] = camera.read_image()
+            self._full[key] = camera.read_image().copy()
         return self._full[key]
 
     def look(self, view: View, index: int) -> Look:

@@ -28,12 +28,13 @@ class _Kept(Generic[Element]):
         self._by_frame: OrderedDict[int, NDArray[Element]] = OrderedDict()
 
     def read(self, frame: int, image: ImageSource) -> NDArray[Element]:
-        if frame not in self._by_frame:
-            self._by_frame[frame] = self._estimate(image.read())
-            if len(self._by_frame) > KEPT:
-                self._by_frame.popitem(last=False)
-        self._by_frame.move_to_end(frame)
-        return self._by_frame[frame].copy()  # what is kept stays as it is, whatever a reader does to its own
+        found = self._by_frame.pop(frame, None)  # one step: another thread may read as well
+        if found is None:
+            found = self._estimate(image.read()).copy()  # an estimator may fill one array again and again
+        self._by_frame[frame] = found
+        if len(self._by_frame) > KEPT:
+            self._by_frame.popitem(last=False)
+        return found.copy()  # what is kept stays as it is, whatever a reader does to its own
 
 
 @dataclass(frozen=True, eq=False)
