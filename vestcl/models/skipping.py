@@ -22,7 +22,8 @@ class Skip:
     """Switches. With ``margin`` None and ``still`` off each of them changes nothing but rounding."""
 
     seen: bool = True
-    """A frame that was encoded by the step before is not encoded again. (Where gradients are recorded, it is.)"""
+    """A frame of the same content as one of the last two is not encoded again while weights and settings stay the
+    same. (Where gradients are recorded, it is.)"""
     background: bool = True
     """The background is encoded around what foreground hides, and not at all where there is none."""
     objects: bool = True
