@@ -2,9 +2,22 @@
 
 import os
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO, Final
+
+#: Bytes of the largest file that is read whole: 16,384 x 8,192 pixels in float64.
+LARGEST: Final = 1 << 30
+
+#: What a path may lead to in place of a file, for messages.
+_KINDS: Final = {
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFCHR: "a character device",
+    stat.S_IFBLK: "a block device",
+    stat.S_IFSOCK: "a socket",
+}
 
 
 @contextmanager
@@ -43,13 +56,40 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         temporary.write_bytes(content)
 
 
-def read_bytes(path: str | Path) -> bytes:
-    """The content of ``path``.
+@contextmanager
+def open_regular(path: str | Path) -> Iterator[BinaryIO]:
+    """A regular file opened for reading; anything else is refused at once, where a FIFO would block for ever.
 
     Raises:
-        ValueError: it can't be read; the message names it.
+        ValueError: it can't be opened or read, or is not a regular file; the message names it.
     """
     try:
-        return Path(path).read_bytes()
+        with open(path, "rb", opener=_without_blocking) as file:
+            kind = stat.S_IFMT(os.fstat(file.fileno()).st_mode)
+            if kind != stat.S_IFREG:
+                raise ValueError(f"{path}: must be a regular file, got {_KINDS.get(kind, 'something else')}")
+            yield file
     except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}") from error
+        raise ValueError(f"{path}: {error.strerror or error}") from error
+
+
+def read_bytes(path: str | Path, limit: int = LARGEST) -> bytes:
+    """The content of ``path``.
+
+    Args:
+        path: a regular file.
+        limit: bytes; a longer file is refused.
+
+    Raises:
+        ValueError: it can't be read, is not a regular file, or is too long; the message names it.
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(limit + 1) if size <= limit else b""
+    if max(size, len(content)) > limit:
+        raise ValueError(f"{path}: must have at most {limit} bytes, got {max(size, len(content))}")
+    return content
+
+
+def _without_blocking(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)

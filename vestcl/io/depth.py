@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vestcl.io._headers import check_size
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.io.exr import read_exr, write_exr
 from vestcl.io.images import read_pixels, write_pixels
@@ -137,15 +138,31 @@ def _read_png(path: str | Path) -> NDArray[np.uint16]:
 def _read_npy(path: str | Path) -> NDArray[np.generic]:
     content = read_bytes(path)
     try:
-        values = np.load(io.BytesIO(content), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
+        shape, fortran, dtype, start = _npy_header(content)
+    except Exception as error:  # NumPy evaluates the header, so that damage may raise anything
         raise ValueError(f"{path}: is no NPY array, or a damaged one ({error})") from error
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fui":
-        raise ValueError(f"{path}: must hold one array of numbers")
-    values = values[0] if values.ndim == 3 and len(values) == 1 else values
-    if values.ndim != 2:
-        raise ValueError(f"{path}: must be [H, W] or [1, H, W], got {list(values.shape)}")
-    return values
+    if dtype.hasobject:
+        raise ValueError(f"{path}: is no NPY array, or a damaged one (it holds Python objects)")
+    if dtype.kind not in "fui":
+        raise ValueError(f"{path}: must hold one array of numbers, got {dtype}")
+    if len(shape) != 2 and not (len(shape) == 3 and shape[0] == 1):
+        raise ValueError(f"{path}: must be [H, W] or [1, H, W], got {list(shape)}")
+    height, width = shape[-2:]
+    check_size(path, height, width)
+    if len(content) - start != height * width * dtype.itemsize:
+        held = f"{height} x {width} {dtype} after {start} bytes of header, got {len(content)} bytes in all"
+        raise ValueError(f"{path}: is no NPY array, or a damaged one (its header states {held})")
+    values = np.frombuffer(content, dtype, offset=start)
+    return values.reshape((width, height)).T if fortran else values.reshape((height, width))
+
+
+def _npy_header(content: bytes) -> tuple[tuple[int, ...], bool, np.dtype[np.generic], int]:
+    """Shape, whether columns come first, dtype, and where the numbers begin."""
+    file = io.BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(file)
+    return tuple(map(int, shape)), fortran, dtype, file.tell()
 
 
 def _pick(path: str | Path, channels: dict[str, NDArray[np.generic]], channel: str | None) -> NDArray[np.generic]:

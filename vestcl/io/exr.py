@@ -15,7 +15,9 @@ import numpy as np
 import OpenEXR  # type: ignore[import-not-found,import-untyped,unused-ignore]
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.io.atomic import replacing
+from vestcl.io._exr_header import check_chunks, read_parts
+from vestcl.io._headers import MAX_PIXELS, check_size
+from vestcl.io.atomic import read_bytes, replacing
 
 #: Channel names of what a frame may have, plane by plane.
 CHANNELS: Final = {
@@ -24,6 +26,9 @@ CHANNELS: Final = {
     "coverage": ("A",),
     "motion": ("motion.X", "motion.Y", "motion.Z"),
 }
+
+#: Numbers in all channels of the largest file that is read: 1 GB in float32.
+MAX_VALUES: Final = 4 * MAX_PIXELS
 
 _COMMENT: Final = (
     "R, G, B: linear light, Rec. 709, not multiplied by A. Z: z-depth in metres, 0 where unknown. A: coverage. "
@@ -81,16 +86,16 @@ def read_exr(path: str | Path) -> dict[str, NDArray[np.generic]]:
         ValueError: no such file, no OpenEXR, damaged, of several parts, with subsampled channels, or with a data
             window that is not its display window.
     """
-    if not Path(path).is_file():
+    if not Path(path).exists():
         raise ValueError(f"{path}: no such file")
+    content = read_bytes(path)
+    _check_claims(path, content)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            parts, header = len(file.parts), dict(file.header())
+            header = dict(file.header())
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError) as error:
+    except Exception as error:  # the library raises what its file's damage leads it to
         raise ValueError(f"{path}: is no OpenEXR image, or a damaged one ({error})") from error
-    if parts != 1:
-        raise ValueError(f"{path}: must have one part, got {parts}")
     (left, top), (right, bottom) = (np.asarray(corner).tolist() for corner in header["dataWindow"])
     if not np.array_equal(header["dataWindow"], header["displayWindow"]):
         raise ValueError(f"{path}: its data window must be its display window; write the whole picture")
@@ -146,6 +151,25 @@ def srgb_from_linear(linear: ArrayLike) -> NDArray[np.float64]:
     """12.92 x up to 0.0031308, 1.055 x^(1/2.4) - 0.055 above: the inverse of `linear_from_srgb`."""
     values = np.asarray(linear, np.float64)
     return np.where(values <= 0.04045 / 12.92, values * 12.92, 1.055 * np.maximum(values, 0) ** (1 / 2.4) - 0.055)
+
+
+def _check_claims(path: str | Path, content: bytes) -> None:
+    """Refuse what the library would allocate too much for, before it does."""
+    try:
+        parts = read_parts(content)
+    except ValueError as error:
+        raise ValueError(f"{path}: is no OpenEXR image, or a damaged one ({error})") from error
+    if len(parts) != 1:
+        raise ValueError(f"{path}: must have one part, got {len(parts)}")
+    (part,) = parts
+    check_size(path, part.height, part.width)
+    if part.height * part.width * part.channels > MAX_VALUES:
+        claim = f"{part.channels} channels of {part.height} x {part.width} pixels"
+        raise ValueError(f"{path}: must have at most {MAX_VALUES} numbers, got {claim}")
+    try:
+        check_chunks(content, part)
+    except ValueError as error:
+        raise ValueError(f"{path}: is no OpenEXR image, or a damaged one ({error})") from error
 
 
 def _storable(array: NDArray[np.generic]) -> NDArray[np.generic]:

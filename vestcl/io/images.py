@@ -6,8 +6,8 @@ from typing import Final
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image, UnidentifiedImageError
 
+from vestcl.io._headers import check_whole, checked_size
 from vestcl.io.atomic import read_bytes, write_bytes
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
@@ -19,23 +19,29 @@ JPEG_QUALITY: Final = 95
 _JPEG: Final = (".jpg", ".jpeg")
 
 
-def read_pixels(path: str | Path) -> Pixels:
+def read_pixels(path: str | Path, size: tuple[int, int] | None = None) -> Pixels:
     """What the file holds, as it is: uint8 or uint16, [H, W, 3] RGB or [H, W] grey. An alpha channel is dropped.
 
     A rotation noted in a photograph's EXIF data is not applied, so that the size is the one of `image_size`.
 
     Args:
         path: PNG, JPEG, or another format that OpenCV decodes to 8 or 16 bits.
+        size: (height, width) that the file must have; looked at before anything is decoded.
 
     Raises:
-        ValueError: no such file, or it can't be decoded.
+        ValueError: no such file, it can't be decoded, it is damaged, of another size, or has more than 2^26 pixels.
     """
-    content = np.frombuffer(read_bytes(path), np.uint8)
+    content = read_bytes(path)
+    got = checked_size(path, content)
+    if size not in (None, got):
+        assert size is not None
+        raise ValueError(f"{path}: must be {size[0]} x {size[1]} as its clip is, got {got[0]} x {got[1]}")
+    check_whole(path, content)
     try:
-        pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
+        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         pixels = None
-    if pixels is None:
+    if pixels is None or pixels.shape[:2] != got:
         raise ValueError(f"{path}: is no image, or a damaged one")
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: must have 8 or 16 bits a channel, got {pixels.dtype}")
@@ -47,28 +53,26 @@ def read_pixels(path: str | Path) -> Pixels:
     return pixels.astype(np.uint8, copy=False)
 
 
-def read_image(path: str | Path) -> NDArray[np.float32]:
+def read_image(path: str | Path, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
     """[3, H, W] float32 RGB in [0, 1]; grey is repeated three times.
 
+    Args:
+        path: as for `read_pixels`.
+        size: (height, width) that the file must have.
+
     Raises:
-        ValueError: no such file, or it can't be decoded.
+        ValueError: as `read_pixels`.
     """
-    return to_float(read_pixels(path))
+    return to_float(read_pixels(path, size))
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
     """(height, width) from the file's header, without decoding it.
 
     Raises:
-        ValueError: no such file, or no image.
+        ValueError: no such file, no image, or one of more than 2^26 pixels.
     """
-    try:
-        with Image.open(path) as image:
-            return image.height, image.width
-    except UnidentifiedImageError as error:
-        raise ValueError(f"{path}: is no image, or a damaged one") from error
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror or error}") from error
+    return checked_size(path, read_bytes(path))
 
 
 def write_pixels(path: str | Path, pixels: Pixels, quality: int = JPEG_QUALITY) -> None:

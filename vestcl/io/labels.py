@@ -4,13 +4,16 @@ M = 1 (static background) for road 0, sidewalk 1, building 2, wall 3, fence 4, v
 void 255; M = 0 for pole 5, traffic light 6, traffic sign 7 and everybody and everything that moves, 11 to 18.
 """
 
+import io
 from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
+from vestcl.io._headers import check_whole, checked_size
+from vestcl.io.atomic import read_bytes
 from vestcl.io.images import read_pixels
 
 LabelKind = Literal["trainIds", "labelIds", "virtual_kitti"]
@@ -101,13 +104,14 @@ def read_ego_vehicle(path: str | Path) -> NDArray[np.bool_]:
 
 def _read_ids(path: str | Path) -> NDArray[np.uint8]:
     """The indices as stored: a palette, as some tools write one for looking at, is not applied."""
+    content = read_bytes(path)
+    checked_size(path, content)
+    check_whole(path, content)
     try:
-        with Image.open(path) as image:
+        with Image.open(io.BytesIO(content)) as image:
             mode, ids = image.mode, np.array(image)
-    except UnidentifiedImageError as error:
-        raise ValueError(f"{path}: is no image, or a damaged one") from error
-    except (OSError, SyntaxError) as error:  # Pillow tells broken PNG chunks by SyntaxError
-        raise ValueError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    except Exception as error:  # Pillow's plugins raise what their format's damage leads them to
+        raise ValueError(f"{path}: is no image, or a damaged one ({error})") from error
     if mode not in ("L", "P"):
         raise ValueError(f"{path}: label ids must be an 8-bit image of one channel, got mode {mode}")
     return ids.astype(np.uint8, copy=False)
