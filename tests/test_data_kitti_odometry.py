@@ -10,7 +10,7 @@ from data_files import pose, real, row, write_pictures, write_text
 from vestcl.data.kitti_odometry import open_kitti_odometry
 from vestcl.data.splits import windows
 
-K = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
+K = np.array([[70.0, 0, 14], [0, 70, 4], [0, 0, 1]])
 #: p4 of cameras 0 to 3, metres.
 SHIFTS = [(0, 0, 0), (-0.5, 0, 0), (0.06, -0.001, 0.002), (-0.48, 0.002, 0.003)]
 POSES = [pose(0.01 * i, (0.1 * i, 0, 0.9 * i)) for i in range(4)]
@@ -33,7 +33,7 @@ def test_both_rigs_by_hand(tmp_path: Path, rig: str, left: int, right: int) -> N
     assert (clip.kind, clip.name, len(clip)) == ("KITTI odometry", "03", 4)
     sample = clip[2]
     assert sample.image.path.parent.name == f"image_{left}"
-    assert sample.K.tolist() == [[700, 0, 600.5], [0, 700, 180.5], [0, 0, 1]]
+    assert sample.K.tolist() == [[70, 0, 14.5], [0, 70, 4.5], [0, 0, 1]]
     assert (sample.name, sample.timestamp) == ("000002", 0.2)
     baseline = np.subtract(SHIFTS[right], SHIFTS[left])
     np.testing.assert_allclose(sample.right.right_from_left[:3, 3], baseline, atol=1e-12)

@@ -12,6 +12,9 @@ from vestcl.data.kitti_raw import EARTH_RADIUS, mercator_pose, open_kitti_raw
 #: Of 2011_09_26's published calib_cam_to_cam.txt.
 P2 = "7.215377e+02 0 6.095593e+02 4.485728e+01 0 7.215377e+02 1.728540e+02 2.163791e-01 0 0 1 2.745884e-03"
 P3 = "7.215377e+02 0 6.095593e+02 -3.395242e+02 0 7.215377e+02 1.728540e+02 2.199936e+00 0 0 1 2.729905e-03"
+#: (height, width) of the images: resized from 375 x 1242 by 0.0267 and 0.0266.
+SIZE = (10, 33)
+K = np.diag([33 / 1242, 10 / 375, 1]) @ [[721.5377, 0, 610.0593], [0, 721.5377, 173.354], [0, 0, 1]]
 #: Where the scanner looks along x, with y to the left and z up, the camera looks along z.
 CAM_FROM_VELO = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
 LATITUDE, LONGITUDE = 49.011, 8.423
@@ -32,12 +35,13 @@ def drive(tmp_path: Path, frames: int = 3) -> Path:
         date / "calib_cam_to_cam.txt",
         *("calib_time: 09-Jan-2012 13:57:47", "corner_dist: 9.95e-02", f"R_rect_00: {identity}"),
         *(f"P_rect_02: {P2}", f"P_rect_03: {P3}"),
+        *("S_rect_02: 1.242000e+03 3.750000e+02", "S_rect_03: 1.242000e+03 3.750000e+02"),
     )
     write_text(date / "calib_velo_to_cam.txt", "calib_time: 15-Mar-2012", f"R: {row(CAM_FROM_VELO)}", "T: 0 0 0")
     write_text(date / "calib_imu_to_velo.txt", "calib_time: 25-May-2012", f"R: {identity}", "T: 0 0 0")
     names = [f"{i:010}.png" for i in range(frames)]
     for camera in ("02", "03"):
-        write_pictures(path / f"image_{camera}" / "data", names, 10, 30)
+        write_pictures(path / f"image_{camera}" / "data", names, *SIZE)
     for i in range(frames):
         write_text(path / "oxts" / "data" / f"{i:010}.txt", oxts(0.8 * i, 0.05 * i))
     times = [f"2011-09-26 13:02:25.{1 + i}64389445" for i in range(frames)]
@@ -49,14 +53,14 @@ def test_cameras_by_hand(tmp_path: Path) -> None:
     clip = open_kitti_raw(drive(tmp_path))
     assert (clip.kind, clip.name, len(clip)) == ("KITTI raw", "2011_09_26_drive_0060_sync", 3)
     sample = clip[0]
-    np.testing.assert_allclose(sample.K, [[721.5377, 0, 610.0593], [0, 721.5377, 173.354], [0, 0, 1]])
+    np.testing.assert_allclose(sample.K, K, rtol=1e-12)
     assert sample.right is not None
     np.testing.assert_allclose(sample.right.K, sample.K)
     shift = sample.right.right_from_left[:3, 3]
     assert shift[0] == pytest.approx(-0.5327, abs=5e-5)
     np.testing.assert_allclose(shift[1:], [(2.199936 - 0.2163791) / 721.5377, -1.6e-5], atol=1e-5)
     assert [s.name for s in clip] == ["0000000000", "0000000001", "0000000002"]
-    assert clip[2].read_image().shape == sample.right.read_image().shape == (3, 10, 30)
+    assert clip[2].read_image().shape == sample.right.read_image().shape == (3, *SIZE)
     assert not np.array_equal(clip[1].read_image(), clip[2].read_image())
     assert [s.timestamp for s in clip] == pytest.approx([0, 0.1, 0.2])
     assert sample.depth is None and sample.labels is None
@@ -104,7 +108,9 @@ def test_depth_from_the_scanner(tmp_path: Path) -> None:
     """A point 10 m ahead is at the principal point, but for camera 2's shift; the nearer of two in a pixel counts."""
     path = drive(tmp_path)
     cameras = path.parent / "calib_cam_to_cam.txt"
-    cameras.write_text(cameras.read_text().replace(P2, "20 0 15 2 0 20 5 0 0 0 1 0"))
+    text = cameras.read_text().replace(P2, "40 0 30.5 4 0 40 10.5 0 0 0 1 0")  # of 20 x 60 pixels, twice the images'
+    cameras.write_text(text.replace("S_rect_02: 1.242000e+03 3.750000e+02", "S_rect_02: 60 20"))
+    write_pictures(path / "image_02" / "data", [f"{i:010}.png" for i in range(3)], 10, 30)
     points = [(10, 0, 0, 0.5), (12, 0, 0, 0.5), (-10, 0, 0, 0.5), (5, -1, 0.5, 0.5), (1, 50, 0, 0.5)]
     scan = path / "velodyne_points" / "data" / "0000000001.bin"
     scan.parent.mkdir(parents=True)
@@ -125,7 +131,7 @@ def test_depth_from_the_scanner(tmp_path: Path) -> None:
 def test_depth_maps_come_first(tmp_path: Path) -> None:
     path = drive(tmp_path)
     maps = path / "proj_depth" / "groundtruth" / "image_02"
-    io.write_depth(maps / "0000000001.png", np.full((10, 30), 3.0), 256)
+    io.write_depth(maps / "0000000001.png", np.full(SIZE, 3.0), 256)
     clip = open_kitti_raw(path)
     assert clip[0].depth is None and (clip[1].read_depth() == 3).all()
 

@@ -9,6 +9,9 @@ from data_files import pose, row, write_pictures, write_text
 from vestcl import io
 from vestcl.data.virtual_kitti import open_virtual_kitti
 
+#: (height, width) of the images: resized from 375 x 1242 by 0.0267 and 0.0266.
+SIZE = (10, 33)
+
 WORLD_FROM_CAM = [pose(0.02 * i, (100 + 0.1 * i, -2, 0.9 * i)) for i in range(3)]
 
 
@@ -24,10 +27,10 @@ def tree(tmp_path: Path, variant: str = "clone") -> Path:
     write_text(folder / "intrinsic.txt", *intrinsic)
     frames = folder / "frames"
     for camera in ("Camera_0", "Camera_1"):
-        write_pictures(frames / "rgb" / camera, [f"rgb_{i:05}.jpg" for i in range(3)], 10, 30)
+        write_pictures(frames / "rgb" / camera, [f"rgb_{i:05}.jpg" for i in range(3)], *SIZE)
     for i in range(3):
-        io.write_pixels(frames / "depth" / "Camera_0" / f"depth_{i:05}.png", np.full((10, 30), 150 + i, np.uint16))
-        classes = np.full((10, 30, 3), (90, 200, 255), np.uint8)
+        io.write_pixels(frames / "depth" / "Camera_0" / f"depth_{i:05}.png", np.full(SIZE, 150 + i, np.uint16))
+        classes = np.full((*SIZE, 3), (90, 200, 255), np.uint8)
         classes[5:] = (0, 139, 139)
         io.write_pixels(frames / "classSegmentation" / "Camera_0" / f"classgt_{i:05}.png", classes)
     return folder
@@ -37,14 +40,15 @@ def test_by_hand(tmp_path: Path) -> None:
     clip = open_virtual_kitti(tree(tmp_path))
     assert (clip.kind, clip.name, len(clip), clip.fps) == ("Virtual KITTI 2", "Scene01/clone", 3, 10)
     sample = clip[2]
-    assert sample.K.tolist() == [[725.0087, 0, 621], [0, 725.0087, 187.5], [0, 0, 1]]
+    full = np.array([[725.0087, 0, 621], [0, 725.0087, 187.5], [0, 0, 1]])
+    np.testing.assert_allclose(sample.K, np.diag([33 / 1242, 10 / 375, 1]) @ full)
     np.testing.assert_allclose(sample.world_from_cam, WORLD_FROM_CAM[2], atol=1e-10)
     assert sample.right is not None and np.array_equal(sample.right.K, sample.K)
     np.testing.assert_allclose(sample.right.right_from_left, pose(0, (-0.532725, 0, 0)), atol=1e-10)
     assert (sample.read_depth() == np.float32(1.52)).all()
     assert sample.read_labels()[0, ::5, 0].tolist() == [10, 13]
     assert sample.read_mask()[0, ::5, 0].tolist() == [True, False]
-    assert sample.read_image().shape == sample.right.read_image().shape == (3, 10, 30)
+    assert sample.read_image().shape == sample.right.read_image().shape == (3, *SIZE)
 
 
 def test_variants(tmp_path: Path) -> None:

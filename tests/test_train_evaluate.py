@@ -172,7 +172,7 @@ def drives(root: Path, names: tuple[str, ...], frames: int = 7) -> Path:
     K, right = clip[0].K, clip[0].right
     assert right is not None
     flat = f"{K[0, 0]} 0 {K[0, 2] - 0.5} {{}} 0 {K[1, 1]} {K[1, 2] - 0.5} 0 0 0 1 0"
-    calibration(root, flat.format(0), flat.format(K[0, 0] * right.right_from_left[0, 3]))
+    calibration(root, flat.format(0), flat.format(K[0, 0] * right.right_from_left[0, 3]), f"{SIZE[1]} {SIZE[0]}")
     for name in names:
         for index, sample in enumerate(clip):
             assert sample.right is not None

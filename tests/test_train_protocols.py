@@ -24,8 +24,9 @@ P2 = "721.5377 0 609.5593 44.85728 0 721.5377 172.854 0.2163791 0 0 1 0.00274588
 P3 = "721.5377 0 609.5593 -339.5242 0 721.5377 172.854 2.199936 0 0 1 0.002729905"
 
 
-def calibration(root: Path, left: str = P2, right: str = P3) -> None:
-    lines = "R_rect_00: 1 0 0 0 1 0 0 0 1", f"P_rect_02: {left}", f"P_rect_03: {right}"
+def calibration(root: Path, left: str = P2, right: str = P3, size: str = "1242 375") -> None:
+    sizes = (f"S_rect_0{camera}: {size}" for camera in (2, 3))
+    lines = "R_rect_00: 1 0 0 0 1 0 0 0 1", f"P_rect_02: {left}", f"P_rect_03: {right}", *sizes
     write_text(root / "2011_09_26" / "calib_cam_to_cam.txt", *lines)
 
 
@@ -35,7 +36,7 @@ def empty_drives(root: Path, frames: Mapping[str, int]) -> Path:
     for number, count in frames.items():
         for camera in ("02", "03"):
             folder = root / "2011_09_26" / f"2011_09_26_drive_{number}_sync" / f"image_{camera}" / "data"
-            write_pixels(folder / f"{0:010}.png", picture(4, 12))
+            write_pixels(folder / f"{0:010}.png", picture(10, 33))
             for index in range(1, count):
                 (folder / f"{index:010}.png").touch()
     return root

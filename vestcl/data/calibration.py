@@ -17,6 +17,9 @@ Matrix = NDArray[np.float64]
 #: How far R R^T of a pose may be from the identity: files have six digits and more.
 ROTATION_TOLERANCE: Final = 1e-4
 
+#: Metres; positions of drives are on one planet.
+FARTHEST: Final = 1e8
+
 
 def from_integer_centres(K: ArrayLike) -> Matrix:
     """[[1, 0, 1/2], [0, 1, 1/2], [0, 0, 1]] K: intrinsics with pixel centres at integers to those at +0.5.
@@ -97,11 +100,14 @@ def check_rigid(dst_from_src: Matrix, where: str) -> None:
     """Refuse what is no rigid motion.
 
     Raises:
-        ValueError: not [4, 4], not finite, another last row than (0, 0, 0, 1), or R no rotation.
+        ValueError: not [4, 4], not finite, another last row than (0, 0, 0, 1), R no rotation, or a shift of more
+            than FARTHEST.
     """
     if dst_from_src.shape != (4, 4):
         raise ValueError(f"{where}: a pose must be [4, 4], got {list(dst_from_src.shape)}")
+    if not (np.isfinite(dst_from_src).all() and np.abs(dst_from_src).max() <= FARTHEST):
+        raise ValueError(f"{where}: must be a rotation and a finite shift, got {dst_from_src.tolist()}")
     rotation = dst_from_src[:3, :3]
     straight = np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE) and np.linalg.det(rotation) > 0
-    if not (np.isfinite(dst_from_src).all() and straight and np.array_equal(dst_from_src[3], [0, 0, 0, 1])):
+    if not (straight and np.array_equal(dst_from_src[3], [0, 0, 0, 1])):
         raise ValueError(f"{where}: must be a rotation and a finite shift, got {dst_from_src.tolist()}")

@@ -2,25 +2,22 @@
 
 Only the 20th frame of a snippet is annotated; its name is the snippet's name, and its camera file is for all 30.
 What else there is goes by the frame's name too: rightImg8bit_sequence, disparity_sequence or disparity, gtFine.
-Pictures that were made smaller on the disk are fine: camera files are for 2048 x 1024, and K is scaled.
+Camera files are for 2048 x 1024: K is scaled for images that were resized, and cropped ones are refused.
 """
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-import torch
-
-from vestcl import geometry
-from vestcl.data import calibration
+from vestcl.data import calibration, files, fit
 from vestcl.data.calibration import Matrix
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DisparityFile, EgoVehicleFile, ImageFile, LabelFile
 from vestcl.io.atomic import read_bytes
 from vestcl.io.images import image_size
+from vestcl.io.strict_json import parse_json
 
 #: (height, width) that camera files are for.
 NATIVE: Final = (1024, 2048)
@@ -32,14 +29,18 @@ AFTER: Final = 10
 #: Frames a second.
 FPS: Final = 17.0
 
+#: Metres between two cameras of one car, at most.
+LONGEST_BASELINE: Final = 100.0
+
 _FRAMES: Final = "leftImg8bit_sequence"
-_NAME: Final = re.compile(r"([a-z-]+)_(\d{6})_(\d{6})(?:_leftImg8bit\.png)?")
+_NAME: Final = re.compile(r"([a-z-]+)_(\d{6})_(\d{6})(?:_leftImg8bit(?i:\.png))?", re.ASCII)
 
 
 @dataclass(frozen=True)
 class _Camera:
     """A camera file's numbers: K [3, 3] of 2048 x 1024 with centres at +0.5, fx in px and the baseline in metres."""
 
+    path: Path
     K: Matrix
     fx: float
     baseline: float
@@ -62,22 +63,21 @@ def open_cityscapes(path: str | Path, snippet: str | None = None) -> Clip:
     root, tail = folder.parents[2], Path(folder.parent.name) / folder.name
     camera = _read_camera(root / "camera" / tail / f"{name}_camera.json")
     frames = _frames(folder, name)
-    height, width = image_size(next(iter(frames.values())))
-    K = geometry.scale_intrinsics(torch.from_numpy(camera.K), width / NATIVE[1], height / NATIVE[0]).numpy()
-    right_from_left = calibration.translation((-camera.baseline, 0, 0))
-    bonnet = root / "gtFine" / tail / f"{name}_gtFine_labelIds.png"
+    size = image_size(next(iter(frames.values())))
+    K = fit.fit_intrinsics(camera.K, NATIVE, size, str(camera.path))
+    rights = _rights(root / "rightImg8bit_sequence" / tail, list(frames), camera)
+    bonnet = _find_file(root / "gtFine" / tail, f"{name}_gtFine_labelIds")
     samples = []
     for index, (frame, file) in enumerate(frames.items()):
-        second = root / "rightImg8bit_sequence" / tail / f"{frame}_rightImg8bit.png"
         sample = Sample(
             frame,
-            ImageFile(file, height, width),
+            ImageFile(file, *size),
             K,
             timestamp=index / FPS,
             depth=_depth(root, tail, frame, camera),
             labels=_labels(root, tail, frame),
-            ego_vehicle=EgoVehicleFile(bonnet) if bonnet.is_file() else None,
-            right=RightCamera(ImageFile(second, height, width), K, right_from_left) if second.is_file() else None,
+            ego_vehicle=EgoVehicleFile(bonnet) if bonnet else None,
+            right=rights.get(frame),
         )
         samples.append(sample)
     return Clip(name, "Cityscapes", tuple(samples))
@@ -120,13 +120,30 @@ def _frames(folder: Path, name: str) -> dict[str, Path]:
     """The files of a snippet's frames by name; at either end some may be missing, between them none."""
     city, sequence, annotated = _parts(name)
     numbers = range(max(annotated - BEFORE, 0), annotated + AFTER + 1)
-    files = {f"{city}_{sequence}_{n:06}": folder / f"{city}_{sequence}_{n:06}_leftImg8bit.png" for n in numbers}
-    there = [index for index, file in enumerate(files.values()) if file.is_file()]
-    whole = list(files.items())[there[0] : there[-1] + 1] if there else list(files.items())
-    for _, file in whole:
-        if not file.is_file():
-            raise ValueError(f"{file}: no such file")
-    return dict(whole)
+    names = [f"{city}_{sequence}_{n:06}" for n in numbers]
+    found = {frame: file for frame in names if (file := _find_file(folder, f"{frame}_leftImg8bit"))}
+    whole = names[names.index(next(iter(found))) : names.index(list(found)[-1]) + 1] if found else names
+    for frame in whole:
+        if frame not in found:
+            raise ValueError(f"{folder / f'{frame}_leftImg8bit.png'}: no such file")
+    return found
+
+
+def _find_file(folder: Path, stem: str) -> Path | None:
+    """The PNG of a name; its suffix may be in any case. Folders of a city are long, so that they are not listed."""
+    candidates = (folder / f"{stem}{suffix}" for suffix in (".png", ".PNG", ".Png"))
+    return next((path for path in candidates if files.is_present(path)), None)
+
+
+def _rights(folder: Path, frames: list[str], camera: _Camera) -> dict[str, RightCamera]:
+    """By frame."""
+    found = {frame: file for frame in frames if (file := _find_file(folder, f"{frame}_rightImg8bit"))}
+    if not found:
+        return {}
+    size = image_size(next(iter(found.values())))
+    K = fit.fit_intrinsics(camera.K, NATIVE, size, str(camera.path))
+    right_from_left = calibration.translation((-camera.baseline, 0, 0))
+    return {frame: RightCamera(ImageFile(file, *size), K, right_from_left) for frame, file in found.items()}
 
 
 def _below(path: Path) -> Iterator[tuple[Path, str]]:
@@ -138,7 +155,8 @@ def _below(path: Path) -> Iterator[tuple[Path, str]]:
     cities = sorted(top.glob("/".join(["*"] * levels))) if levels > 0 else [top]
     for city in cities:
         cameras = city.parents[2] / "camera" / city.parent.name / city.name
-        numbered = {_parts(frame.name) for frame in city.glob("*_leftImg8bit.png")}
+        frames = (file.name for file in city.iterdir() if not file.name.startswith("."))
+        numbered = {_parts(frame) for frame in frames if frame.lower().endswith("_leftimg8bit.png")}
         for file in sorted(cameras.glob("*_camera.json")):
             name = file.name.removesuffix("_camera.json")
             place, sequence, annotated = _parts(name)
@@ -157,32 +175,39 @@ def _parts(name: str) -> tuple[str, str, int]:
 def _read_camera(path: Path) -> _Camera:
     encoded = read_bytes(path)
     try:
-        content = json.loads(encoded)
+        content = parse_json(encoded)
         inner = content["intrinsic"]
-        fx, fy, u0, v0 = (float(inner[key]) for key in ("fx", "fy", "u0", "v0"))
-        baseline = float(content["extrinsic"]["baseline"])
+        fx, fy, u0, v0 = (_number(inner[key]) for key in ("fx", "fy", "u0", "v0"))
+        baseline = _number(content["extrinsic"]["baseline"])
     except (ValueError, TypeError) as error:  # of JSON, of its encoding, of a number
         raise ValueError(f"{path}: is no Cityscapes camera file ({error})") from error
     except KeyError as error:
         raise ValueError(f"{path}: has no {error}") from error
     K = calibration.intrinsics(fx, fy, u0, v0)
     calibration.check_intrinsics(K, str(path))
-    if not 0 < baseline < float("inf"):
+    if not 0 < baseline < LONGEST_BASELINE:
         raise ValueError(f"{path}: `baseline` must be positive, got {baseline}")
-    return _Camera(calibration.from_integer_centres(K), fx, baseline)
+    return _Camera(path, calibration.from_integer_centres(K), fx, baseline)
+
+
+def _number(value: Any) -> float:
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise TypeError(f"{value!r:.40} is no number")
+    try:
+        return float(value)
+    except OverflowError:
+        return float("inf")
 
 
 def _depth(root: Path, tail: Path, frame: str, camera: _Camera) -> DisparityFile | None:
     for folder in ("disparity_sequence", "disparity"):
-        path = root / folder / tail / f"{frame}_disparity.png"
-        if path.is_file():
+        if path := _find_file(root / folder / tail, f"{frame}_disparity"):
             return DisparityFile(path, camera.baseline, camera.fx)
     return None
 
 
 def _labels(root: Path, tail: Path, frame: str) -> LabelFile | None:
-    train_ids = root / "gtFine" / tail / f"{frame}_gtFine_labelTrainIds.png"
-    label_ids = root / "gtFine" / tail / f"{frame}_gtFine_labelIds.png"
-    if train_ids.is_file():
+    if train_ids := _find_file(root / "gtFine" / tail, f"{frame}_gtFine_labelTrainIds"):
         return LabelFile(train_ids, "trainIds")
-    return LabelFile(label_ids, "labelIds") if label_ids.is_file() else None
+    label_ids = _find_file(root / "gtFine" / tail, f"{frame}_gtFine_labelIds")
+    return LabelFile(label_ids, "labelIds") if label_ids else None

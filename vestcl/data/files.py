@@ -1,48 +1,170 @@
-"""The files beside the pictures: numbered frames, tables of numbers, poses and KITTI's calibrations."""
+"""Files next to the images: names and numbers of frames, tables of numbers, poses, KITTI's calibrations."""
 
-from collections.abc import Sequence
+import logging
+import re
+from collections.abc import Container, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 
 from vestcl.data.calibration import Matrix, check_intrinsics, check_rigid, rigid, split_projection
 from vestcl.io.atomic import read_bytes
 
-#: Suffixes of the pictures that readers look for; KITTI's PNGs are often kept as JPEG.
+#: Suffixes of the images that readers look for, in lower case; KITTI's PNGs are often kept as JPEG.
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 
+#: Bytes of the largest text file that is read.
+_LARGEST_TEXT: Final = 1 << 28
 
-def images(folder: Path) -> list[Path]:
-    """The pictures of a folder by name, hidden files left out; none where there is no such folder."""
-    if not folder.is_dir():
-        return []
-    return sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith("."))
+_LOG: Final = logging.getLogger(__name__)
+
+Entry = TypeVar("Entry")
 
 
-def numbered_images(folder: Path, prefix: str = "", gaps: bool = False) -> dict[int, Path]:
-    """The pictures of a folder by the number in their names, in order.
+# ---------------------------------------------------------------- names
+
+
+def natural(name: str) -> tuple[list[str | int], str]:
+    """A key that sorts names by the numbers in them: frame1, frame2, frame10."""
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
+
+
+def by_name(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
+    """The files of a folder by their names without the suffix, in natural order; hidden ones are left out.
 
     Args:
         folder: need not exist.
-        prefix: what stands before the number.
+        suffixes: in lower case; files may have them in any.
+
+    Raises:
+        ValueError: it is no folder, can't be read, or has two files of one name.
+    """
+    found: dict[str, Path] = {}
+    if not is_present(folder):
+        return found
+    try:
+        entries = sorted(folder.iterdir(), key=lambda file: natural(file.name))
+    except OSError as error:
+        raise ValueError(f"{folder}: {error.strerror}") from error
+    for file in entries:
+        if file.suffix.lower() not in suffixes or file.name.startswith("."):
+            continue
+        if file.stem in found:
+            raise ValueError(f"{file}: has the name of {found[file.stem].name}; one of the two must go")
+        found[file.stem] = file
+    return {name: found[name] for name in sorted(found, key=natural)}
+
+
+def next_to(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> dict[str, Path]:
+    """The files of a folder that have the frames' names; the frames that have none are logged.
+
+    Args:
+        folder: need not exist.
+        names: of the frames, without suffix.
+        suffixes: in lower case.
+
+    Raises:
+        ValueError: the folder is there, but none of its files fits.
+    """
+    found = by_name(folder, suffixes)
+    if is_present(folder):
+        check_fit(folder, names, found, suffixes)
+    return {name: found[name] for name in names if name in found}
+
+
+def check_fit(folder: Path, names: Sequence[Entry], found: Container[Entry], suffixes: Sequence[str] = ("",)) -> None:
+    """Refuse files of which none fits a frame, and log it where some frames have none.
+
+    Args:
+        folder: for the message.
+        names: of the frames, or their numbers.
+        found: of the files.
+        suffixes: of the files.
+
+    Raises:
+        ValueError: none fits.
+    """
+    missing = [name for name in names if name not in found]
+    if len(missing) == len(names):
+        wanted = " or ".join(f"{names[0]}{suffix}" for suffix in suffixes)
+        have = next((file.name for file in sorted(folder.iterdir(), key=lambda file: natural(file.name))), "nothing")
+        raise ValueError(
+            f"{folder}: has no file for any of {len(names)} frames; the first must be {wanted}, got {have} "
+            "(without such files, remove the folder)"
+        )
+    if missing:
+        have = f"has files for {len(names) - len(missing)} of {len(names)} frames"
+        _LOG.warning("%s: %s; the first frame without one is %s", folder, have, missing[0])
+
+
+def is_present(path: Path) -> bool:
+    """Whether there is anything at ``path``, be it a link that leads nowhere."""
+    return path.exists() or path.is_symlink()
+
+
+def images(folder: Path) -> list[Path]:
+    """The images of a folder in natural order of their names, hidden files left out; none where it does not exist.
+
+    Raises:
+        ValueError: it is no folder, or has two images of one name.
+    """
+    return list(by_name(folder, IMAGE_SUFFIXES).values())
+
+
+def numbered_images(folder: Path, prefix: str = "", gaps: bool = False) -> dict[int, Path]:
+    """`numbered` of the images of a folder.
+
+    Raises:
+        ValueError: as `numbered`.
+    """
+    return numbered(folder, IMAGE_SUFFIXES, prefix, gaps)
+
+
+def numbered(folder: Path, suffixes: Sequence[str], prefix: str = "", gaps: bool = False) -> dict[int, Path]:
+    """The files of a folder by the number in their names, in order.
+
+    Args:
+        folder: need not exist.
+        suffixes: in lower case; files may have them in any.
+        prefix: what comes before the number.
         gaps: whether numbers may be missing between the first and the last.
 
     Raises:
-        ValueError: a name that is no number, two pictures of one number, or a gap.
+        ValueError: a name that is no number, two files of one number, or a gap.
     """
     found: dict[int, Path] = {}
-    for file in images(folder):
-        word = file.stem.removeprefix(prefix)
-        if not (word.isascii() and word.isdigit() and file.stem.startswith(prefix)):
+    for word, file in by_name(folder, suffixes).items():
+        digits = word.removeprefix(prefix)
+        if not (digits.isascii() and digits.isdigit() and word.startswith(prefix)):
             raise ValueError(f"{file}: must be named by its number, as {prefix}000000{file.suffix}")
-        if int(word) in found:
-            raise ValueError(f"{file}: has the number of {found[int(word)].name}")
-        found[int(word)] = file
+        if int(digits) in found:
+            raise ValueError(f"{file}: has the number of {found[int(digits)].name}")
+        found[int(digits)] = file
     for number, following in zip(sorted(found), sorted(found)[1:], strict=False):
         if following != number + 1 and not gaps:
             raise ValueError(f"{folder}: the frame after {found[number].name} is missing")
     return dict(sorted(found.items()))
+
+
+def numbered_next_to(
+    folder: Path, numbers: Sequence[int], suffixes: Sequence[str] = IMAGE_SUFFIXES, prefix: str = ""
+) -> dict[int, Path]:
+    """`numbered` files that go with the frames of these numbers; an empty folder is as one that is not there.
+
+    Raises:
+        ValueError: as `numbered`, or the folder has files of which none fits.
+    """
+    found = numbered(folder, suffixes, prefix, gaps=True)
+    if found:
+        width = len(next(iter(found.values())).stem.removeprefix(prefix))
+        names = [f"{prefix}{number:0{width}}" for number in numbers]
+        check_fit(folder, names, {f"{prefix}{number:0{width}}" for number in found}, suffixes[:1])
+    return found
+
+
+# ---------------------------------------------------------------- contents
 
 
 def read_lines(path: Path) -> list[str]:
@@ -52,7 +174,7 @@ def read_lines(path: Path) -> list[str]:
         ValueError: it can't be read, or is no text.
     """
     try:
-        text = read_bytes(path).decode("utf-8")
+        text = read_bytes(path, _LARGEST_TEXT).decode("utf-8")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is no text") from error
     return [line for line in text.splitlines() if line.strip()]
@@ -119,6 +241,19 @@ class Calibration:
 
     def __contains__(self, name: str) -> bool:
         return name in self._entries
+
+    def size(self, name: str) -> tuple[int, int] | None:
+        """(height, width) of the entry ``name``, `width height`; None where it is not there.
+
+        Raises:
+            ValueError: it is not two whole numbers above 0.
+        """
+        if name not in self._entries:
+            return None
+        width, height = self.entry(name, 2)
+        if not (width > 0 and height > 0 and width == int(width) and height == int(height)):
+            raise ValueError(f"{self.path}: `{name}` must be a width and a height in pixels, got {[width, height]}")
+        return int(height), int(width)
 
     def entry(self, name: str, size: int) -> Matrix:
         """The ``size`` numbers of entry ``name``.

@@ -5,7 +5,7 @@ calib.txt has P0 .. P3 = K [I | p4]; a line of poses is 3x4 world_from_cam0, of 
 
 from pathlib import Path
 
-from vestcl.data import calibration, files
+from vestcl.data import calibration, files, fit
 from vestcl.data.calibration import Matrix
 from vestcl.data.files import Calibration
 from vestcl.data.kitti_raw import RIGS, Rig
@@ -23,7 +23,7 @@ def open_kitti_odometry(path: str | Path, sequence: str | None = None, rig: Rig 
         rig: "colour" (image_2, image_3) or "grey" (image_0, image_1); None takes colour where it is there.
 
     Raises:
-        ValueError: a file is missing or malformed; the message names it.
+        ValueError: a file is missing or malformed, or the images can't be of its cameras; the message names it.
 
     Source: SPEC section 9; devkit of KITTI odometry (Geiger et al., CVPR 2012).
     """
@@ -33,11 +33,11 @@ def open_kitti_odometry(path: str | Path, sequence: str | None = None, rig: Rig 
     if not frames:
         raise ValueError(f"{folder}: has no image_{left}/*.png")
     cameras = Calibration(folder / "calib.txt")
-    K, left_from_cam0 = cameras.projection(f"P{left}")
     size = image_size(next(iter(frames.values())))
+    K, left_from_cam0 = _camera(left, size, cameras)
     last = max(frames)
     poses, times = _poses(folder, left_from_cam0, last), _times(folder, last)
-    rights = _rights(folder, right, left_from_cam0, cameras)
+    rights = _rights(folder, right, left_from_cam0, cameras, list(frames))
     samples = [
         Sample(
             frame.stem,
@@ -73,28 +73,37 @@ def _rig(folder: Path, rig: Rig | None) -> Rig:
     return rig
 
 
-def _rights(folder: Path, right: int, left_from_cam0: Matrix, cameras: Calibration) -> dict[int, RightCamera]:
-    """By frame; none where the sequence has no pictures of that camera."""
-    frames = files.numbered_images(folder / f"image_{right}", gaps=True)
+def _camera(camera: int, size: tuple[int, int], cameras: Calibration) -> tuple[Matrix, Matrix]:
+    """K of images of ``size``, and cam_from_cam0. calib.txt does not state a size, so that K is not scaled."""
+    name = f"P{camera}"
+    K, cam_from_cam0 = cameras.projection(name)
+    return fit.fit_kitti(K, size, f"{cameras.path}: `{name}`"), cam_from_cam0
+
+
+def _rights(
+    folder: Path, right: int, left_from_cam0: Matrix, cameras: Calibration, numbers: list[int]
+) -> dict[int, RightCamera]:
+    """By frame; none where the sequence has no images of that camera."""
+    frames = files.numbered_next_to(folder / f"image_{right}", numbers)
     if not frames:
         return {}
-    K, right_from_cam0 = cameras.projection(f"P{right}")
-    right_from_left = right_from_cam0 @ calibration.invert(left_from_cam0)
     size = image_size(next(iter(frames.values())))
+    K, right_from_cam0 = _camera(right, size, cameras)
+    right_from_left = right_from_cam0 @ calibration.invert(left_from_cam0)
     return {number: RightCamera(ImageFile(frame, *size), K, right_from_left) for number, frame in frames.items()}
 
 
 def _poses(folder: Path, left_from_cam0: Matrix, last: int) -> Matrix | None:
     """world_from_left by the number of the frame: a part of a sequence keeps the names of its frames."""
     path = folder.parent.parent / "poses" / f"{folder.name}.txt"
-    if not path.is_file():
+    if not files.is_present(path):
         return None
     return _long_enough(files.read_poses(path), path, last) @ calibration.invert(left_from_cam0)
 
 
 def _times(folder: Path, last: int) -> Matrix | None:
     path = folder / "times.txt"
-    return _long_enough(files.read_rows(path, (1,))[:, 0], path, last) if path.is_file() else None
+    return _long_enough(files.read_rows(path, (1,))[:, 0], path, last) if files.is_present(path) else None
 
 
 def _long_enough(rows: Matrix, path: Path, last: int) -> Matrix:

@@ -13,7 +13,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.data import calibration, files
+from vestcl.data import calibration, files, fit
 from vestcl.data.calibration import Matrix
 from vestcl.data.files import Calibration
 from vestcl.data.sample import Clip, RightCamera, Sample
@@ -28,6 +28,9 @@ EARTH_RADIUS: Final = 6378137.0
 #: Numbers in a line of oxts: latitude, longitude, altitude, roll, pitch, yaw and 24 more.
 OXTS_NUMBERS: Final = 30
 
+#: A laser's return is farther from the camera than this, metres.
+NEAREST: Final = 0.01
+
 Rig = Literal["colour", "grey"]
 """Which stereo pair: cameras 2 and 3, or 0 and 1."""
 
@@ -36,14 +39,14 @@ RIGS: Final[dict[str, tuple[int, int]]] = {"colour": (2, 3), "grey": (0, 1)}
 
 @dataclass(frozen=True, eq=False)
 class VelodyneScan:
-    """A laser scan projected into a picture: depth of the nearest return in each pixel."""
+    """A laser scan projected into an image: depth of the nearest return in each pixel."""
 
     path: Path
     """float32 x, y, z, reflectance in the scanner's axes."""
     cam_from_velo: Matrix
     """[4, 4]."""
     K: Matrix
-    """[3, 3] px, pixel centres at +0.5."""
+    """[3, 3] px of an image of ``height`` x ``width``, pixel centres at +0.5."""
     height: int
     width: int
 
@@ -57,8 +60,9 @@ class VelodyneScan:
         if len(content) % 16:
             raise ValueError(f"{self.path}: must be float32 quadruples, got {len(content)} bytes")
         scan = np.frombuffer(content, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
-        points = scan @ self.cam_from_velo[:3, :3].T + self.cam_from_velo[:3, 3]
-        points = points[points[:, 2] > 0]
+        with np.errstate(invalid="ignore"):  # of points that are not finite
+            points = scan @ self.cam_from_velo[:3, :3].T + self.cam_from_velo[:3, 3]
+        points = points[(points[:, 2] > NEAREST) & np.isfinite(points).all(axis=1)]
         u, v = (points[:, :2] / points[:, 2:] * self.K[[0, 1], [0, 1]] + self.K[:2, 2]).T
         inside = (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
         depth = np.full((1, self.height, self.width), np.inf, np.float32)
@@ -79,7 +83,8 @@ def open_kitti_raw(path: str | Path, rig: Rig = "colour", first_pose_identity: b
         first_pose_identity: the world is the first camera; otherwise the Mercator plane, far from its origin.
 
     Raises:
-        ValueError: a file is missing or malformed; the message names it.
+        ValueError: a file is missing or malformed, or the images can't be of the rectified cameras; the message
+            names it.
 
     Source: SPEC section 9; devkit of KITTI raw (Geiger et al., IJRR 2013).
     """
@@ -91,12 +96,12 @@ def open_kitti_raw(path: str | Path, rig: Rig = "colour", first_pose_identity: b
     if not frames:
         raise ValueError(f"{drive}: has no image_{left:02}/data/*.png")
     cameras = Calibration(drive.parent / "calib_cam_to_cam.txt")
-    K, cam_from_rect0 = cameras.projection(f"P_rect_{left:02}")
     size = image_size(next(iter(frames.values())))
+    K, cam_from_rect0 = _camera(drive, left, size, cameras)
     poses = _poses(drive, list(frames), cam_from_rect0, cameras)
     times = _times(drive / f"image_{left:02}" / "timestamps.txt", list(frames))
-    depths = _depths(drive, left, K, cam_from_rect0, size, cameras)
-    rights = _rights(drive, right, cam_from_rect0, cameras)
+    depths = _depths(drive, left, K, cam_from_rect0, size, cameras, list(frames))
+    rights = _rights(drive, right, cam_from_rect0, cameras, list(frames))
     samples = []
     for (number, frame), time, pose in zip(frames.items(), times, poses, strict=True):
         image, depth, second = ImageFile(frame, *size), depths.get(number), rights.get(number)
@@ -125,14 +130,42 @@ def mercator_pose(oxts: NDArray[np.float64], scale: float) -> Matrix:
     return calibration.rigid(about_z @ about_y @ about_x, (x, y, altitude))
 
 
-def _rights(drive: Path, right: int, left_from_rect0: Matrix, cameras: Calibration) -> dict[int, RightCamera]:
-    """By frame; none where the drive has no pictures of that camera."""
-    frames = files.numbered_images(drive / f"image_{right:02}" / "data", gaps=True)
+def _camera(drive: Path, camera: int, size: tuple[int, int], cameras: Calibration) -> tuple[Matrix, Matrix]:
+    """K of images of ``size``, and cam_from_rect0. `S_rect` states the size that `P_rect` is for."""
+    K, cam_from_rect0 = cameras.projection(f"P_rect_{camera:02}")
+    calibrated, recorded = cameras.size(f"S_rect_{camera:02}"), cameras.size(f"S_{camera:02}")
+    where = f"{cameras.path}: `P_rect_{camera:02}`"
+    unrectified = recorded is not None and fit.same_proportions(recorded, size)
+    if drive.name.endswith("_extract") or (unrectified and calibrated and not fit.same_proportions(calibrated, size)):
+        raise ValueError(
+            f"{where}: is for rectified images, but those of {drive}, {size} (height, width), are as they were "
+            f"recorded; open the drive's _sync folder{_recorded_camera(camera, cameras)}"
+        )
+    if calibrated is None:
+        return fit.fit_kitti(K, size, where), cam_from_rect0
+    return fit.fit_intrinsics(K, calibrated, size, where), cam_from_rect0
+
+
+def _recorded_camera(camera: int, cameras: Calibration) -> str:
+    """The camera.json of images that are not rectified, as far as the file has their calibration."""
+    names = [f"{name}_{camera:02}" for name in ("K", "D", "S")]
+    if not all(name in cameras for name in names):
+        return ""
+    K, size = calibration.from_integer_centres(cameras.entry(names[0], 9).reshape(3, 3)), cameras.size(names[2])
+    distortion = dict(zip(("k1", "k2", "p1", "p2", "k3"), cameras.entry(names[1], 5).tolist(), strict=True))
+    return f", or a folder with the images in image/ and this camera.json: {fit.camera_json(K, size, **distortion)}"
+
+
+def _rights(
+    drive: Path, right: int, left_from_rect0: Matrix, cameras: Calibration, numbers: list[int]
+) -> dict[int, RightCamera]:
+    """By frame; none where the drive has no images of that camera."""
+    frames = files.numbered_next_to(drive / f"image_{right:02}" / "data", numbers)
     if not frames:
         return {}
-    K, right_from_rect0 = cameras.projection(f"P_rect_{right:02}")
-    right_from_left = right_from_rect0 @ calibration.invert(left_from_rect0)
     size = image_size(next(iter(frames.values())))
+    K, right_from_rect0 = _camera(drive, right, size, cameras)
+    right_from_left = right_from_rect0 @ calibration.invert(left_from_rect0)
     return {number: RightCamera(ImageFile(frame, *size), K, right_from_left) for number, frame in frames.items()}
 
 
@@ -156,7 +189,7 @@ def _rect0_from_velo(drive: Path, cameras: Calibration) -> Matrix:
 
 def _times(path: Path, frames: list[int]) -> list[float | None]:
     """Seconds since the first frame; None for all where there is no such file."""
-    if not path.is_file():
+    if not files.is_present(path):
         return [None] * len(frames)
     lines = files.read_lines(path)
     try:  # nanoseconds are more than datetime takes
@@ -167,15 +200,21 @@ def _times(path: Path, frames: list[int]) -> list[float | None]:
 
 
 def _depths(
-    drive: Path, left: int, K: Matrix, cam_from_rect0: Matrix, size: tuple[int, int], cameras: Calibration
+    drive: Path,
+    left: int,
+    K: Matrix,
+    cam_from_rect0: Matrix,
+    size: tuple[int, int],
+    cameras: Calibration,
+    numbers: list[int],
 ) -> dict[int, DepthSource]:
     """By frame: KITTI's depth maps where there are any, else the laser scans."""
     folder = drive / "proj_depth" / "groundtruth" / f"image_{left:02}"
-    maps = files.numbered_images(folder, gaps=True)
+    maps = files.numbered_next_to(folder, numbers, (".png",))
     if maps:
         return {number: DepthFile(path, KITTI_UNITS) for number, path in maps.items()}
-    scans = sorted((drive / "velodyne_points" / "data").glob("[0-9]*.bin"))
+    scans = files.numbered_next_to(drive / "velodyne_points" / "data", numbers, (".bin",))
     if not scans:
         return {}
     cam_from_velo = cam_from_rect0 @ _rect0_from_velo(drive, cameras)
-    return {int(path.stem): VelodyneScan(path, cam_from_velo, K, *size) for path in scans}
+    return {number: VelodyneScan(path, cam_from_velo, K, *size) for number, path in scans.items()}

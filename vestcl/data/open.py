@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from vestcl.data import cityscapes, folder, kitti_odometry, kitti_raw, video, virtual_kitti
+from vestcl.data.files import by_name, is_present
+from vestcl.data.lens import lens_of, undistorted_depth, undistorted_labels
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.sources import DepthFile, LabelFile
 from vestcl.io.labels import LabelKind
@@ -29,7 +31,7 @@ def _is_kitti_raw(path: Path) -> bool:
 
 
 def _is_kitti_odometry(path: Path) -> bool:
-    return (path / "sequences").is_dir() or (path / "calib.txt").is_file()
+    return (path / "sequences").is_dir() or is_present(path / "calib.txt")
 
 
 def _is_cityscapes(path: Path) -> bool:
@@ -41,7 +43,7 @@ def _is_virtual_kitti(path: Path) -> bool:
 
 
 def _is_folder(path: Path) -> bool:
-    return path.is_dir() and ((path / "camera.json").is_file() or bool(folder.frames_of(path)))
+    return path.is_dir() and (is_present(path / "camera.json") or bool(folder.frames_of(path)))
 
 
 #: In this order: the first that recognises a path opens it.
@@ -119,22 +121,31 @@ def _recognise(path: Path) -> _Layout:
 
 
 def _with_depth(clip: Clip, where: Path, depth_scale: float | None) -> Clip:
+    found = _named(where, clip, (".png", ".exr", ".npy"))
+
     def add(sample: Sample) -> Sample:
-        return replace(sample, depth=DepthFile(_named(where, sample, (".png", ".exr", ".npy")), depth_scale))
+        file = DepthFile(found[sample.name], depth_scale)
+        return replace(sample, depth=undistorted_depth(file, lens_of(sample.image)))
 
     return replace(clip, samples=tuple(map(add, clip)))
 
 
 def _with_labels(clip: Clip, where: Path, label_ids: LabelKind) -> Clip:
+    found = _named(where, clip, (".png",))
+
     def add(sample: Sample) -> Sample:
-        return replace(sample, labels=LabelFile(_named(where, sample, (".png",)), label_ids))
+        file = LabelFile(found[sample.name], label_ids)
+        return replace(sample, labels=undistorted_labels(file, lens_of(sample.image)))
 
     return replace(clip, samples=tuple(map(add, clip)))
 
 
-def _named(where: Path, sample: Sample, suffixes: tuple[str, ...]) -> Path:
-    for suffix in suffixes:
-        path = where / f"{sample.name}{suffix}"
-        if path.is_file():
-            return path
-    raise ValueError(f"{where}: has no {sample.name} ending in {', '.join(suffixes)}")
+def _named(where: Path, clip: Clip, suffixes: tuple[str, ...]) -> dict[str, Path]:
+    """A file for each frame."""
+    if not where.is_dir():
+        raise ValueError(f"{where}: no such folder")
+    found = by_name(where, suffixes)
+    for sample in clip:
+        if sample.name not in found:
+            raise ValueError(f"{where}: has no {sample.name} ending in {', '.join(suffixes)}")
+    return found

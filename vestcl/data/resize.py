@@ -82,6 +82,23 @@ def resize_labels(labels: NDArray[Element], height: int, width: int) -> NDArray[
     return labels[:, rows[:, None], columns]
 
 
+def sample_grid(
+    image: NDArray[np.float32], rows: NDArray[np.float64], columns: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Bilinear at every row and column of a grid; black outside the image.
+
+    Args:
+        image: [C, H, W].
+        rows: [h] px, pixel centres at integers.
+        columns: [w] px, pixel centres at integers.
+
+    Returns:
+        [C, h, w] float32.
+    """
+    grid = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
+    return np.stack([cv2.remap(plane, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) for plane in image])
+
+
 def check_size(height: int, width: int) -> None:
     """Refuse sizes that are not positive integers.
 

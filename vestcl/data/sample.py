@@ -14,7 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl import geometry
-from vestcl.data import calibration, resize
+from vestcl.data import calibration, fit, resize
 from vestcl.data.sources import (
     DepthArray,
     DepthSource,
@@ -60,6 +60,25 @@ class RightCamera:
             ValueError: the file is missing, damaged or of another size than its clip.
         """
         return resize.resize_image(self.image.read(), self.height, self.width)
+
+    def read_as(self, K: NDArray[np.float64], height: int, width: int) -> NDArray[np.float32]:
+        """[3, height, width] RGB in [0, 1] as the same camera with another K would see it; black outside its image.
+
+        Args:
+            K: [3, 3] px, of an image of ``height`` x ``width``: the left camera's, for rows that correspond.
+            height: px.
+            width: px.
+
+        Raises:
+            ValueError: as `read_image`.
+        """
+        camera = self.resized(height, width)
+        image = camera.read_image()
+        if np.allclose(camera.K, K, rtol=1e-6):
+            return image
+        columns = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0] * camera.K[0, 0] + camera.K[0, 2] - 0.5
+        rows = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1] * camera.K[1, 1] + camera.K[1, 2] - 0.5
+        return resize.sample_grid(image, rows, columns)
 
     def resized(self, height: int, width: int) -> "RightCamera":
         """The same camera at another size, with diag(sx, sy, 1) K."""
@@ -208,7 +227,8 @@ class Sample:
             raise ValueError(f"sample {self.name} has no {name}; its clip comes without")
         planes = source.read()
         height, width = planes.shape[1:]
-        if abs(height * self.image.width / width - self.image.height) >= 1:  # a resize rounds by less than a pixel
+        rounded = abs(height * self.image.width / width - self.image.height) < 1  # by a resize, less than a pixel
+        if not (rounded or fit.same_proportions((height, width), (self.image.height, self.image.width))):
             where = getattr(source, "path", f"sample {self.name}: {name}")
             wanted = f"{self.image.height} x {self.image.width}"
             raise ValueError(f"{where}: must have the proportions of the picture, {wanted}, got {height} x {width}")

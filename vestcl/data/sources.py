@@ -63,11 +63,7 @@ class ImageFile:
         Raises:
             ValueError: no such file, damaged, or of another size.
         """
-        image = read_image(self.path)
-        if image.shape[1:] != (self.height, self.width):
-            got = f"{image.shape[1]} x {image.shape[2]}"
-            raise ValueError(f"{self.path}: must be {self.height} x {self.width} as its clip is, got {got}")
-        return image
+        return read_image(self.path, (self.height, self.width))
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,22 @@
 """Virtual KITTI 2: SceneXX/VARIANT/frames/{rgb,depth,classSegmentation}/Camera_{0,1}/*_%05d.*, and two text files.
 
 A line of extrinsic.txt is the frame, the camera and 4x4 cam_from_world; one of intrinsic.txt is the frame, the camera
-and fx, fy, cx, cy with pixel centres at integers. Depth is uint16 centimetres, 65535 the sky.
+and fx, fy, cx, cy with pixel centres at integers, of 1242 x 375 pixels: K is scaled where images were resized. Depth is
+uint16 centimetres, 65535 the sky.
 """
 
 from pathlib import Path
 from typing import Final
 
-from vestcl.data import calibration, files
+from vestcl.data import calibration, files, fit
 from vestcl.data.calibration import Matrix
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DepthFile, ImageFile, LabelFile
 from vestcl.io.depth import VIRTUAL_KITTI_UNITS
 from vestcl.io.images import image_size
+
+#: (height, width) that intrinsic.txt is for.
+NATIVE: Final = (375, 1242)
 
 #: Frames a second, as KITTI's.
 FPS: Final = 10.0
@@ -28,7 +32,7 @@ def open_virtual_kitti(path: str | Path, variant: str | None = None) -> Clip:
         variant: "clone", "fog", "15-deg-left" ...; needed where ``path`` has several.
 
     Raises:
-        ValueError: a file is missing or malformed; the message names it.
+        ValueError: a file is missing or malformed, or the images can't be of its cameras; the message names it.
 
     Source: SPEC section 9; Cabon et al., "Virtual KITTI 2" (2020).
     """
@@ -37,23 +41,23 @@ def open_virtual_kitti(path: str | Path, variant: str | None = None) -> Clip:
     frames = files.numbered_images(rgb / "Camera_0", "rgb_")
     if not frames:
         raise ValueError(f"{folder}: has no frames/rgb/Camera_0/rgb_*.jpg")
-    rights = files.numbered_images(rgb / "Camera_1", "rgb_", gaps=True)
-    size = image_size(next(iter(frames.values())))
+    numbers, size = list(frames), image_size(next(iter(frames.values())))
+    rights = files.numbered_next_to(rgb / "Camera_1", numbers, prefix="rgb_")
+    depths = files.numbered_next_to(rgb.parent / "depth" / "Camera_0", numbers, (".png",), "depth_")
+    labels = files.numbered_next_to(rgb.parent / "classSegmentation" / "Camera_0", numbers, (".png",), "classgt_")
+    right_size = image_size(next(iter(rights.values()))) if rights else size
     cameras, poses = _cameras(folder / "intrinsic.txt"), _poses(folder / "extrinsic.txt")
     samples = []
     for number, file in frames.items():
-        word = file.stem.removeprefix("rgb_")
-        depth = rgb.parent / "depth" / "Camera_0" / f"depth_{word}.png"
-        labels = rgb.parent / "classSegmentation" / "Camera_0" / f"classgt_{word}.png"
         sample = Sample(
-            word,
+            file.stem.removeprefix("rgb_"),
             ImageFile(file, *size),
-            cameras[number, 0],
+            cameras.fitted(number, 0, size),
             timestamp=number / FPS,
             world_from_cam=calibration.invert(poses[number, 0]),
-            depth=DepthFile(depth, VIRTUAL_KITTI_UNITS) if depth.is_file() else None,
-            labels=LabelFile(labels, "virtual_kitti") if labels.is_file() else None,
-            right=_right(ImageFile(rights[number], *size), number, cameras, poses) if number in rights else None,
+            depth=DepthFile(depths[number], VIRTUAL_KITTI_UNITS) if number in depths else None,
+            labels=LabelFile(labels[number], "virtual_kitti") if number in labels else None,
+            right=_right(ImageFile(rights[number], *right_size), number, cameras, poses) if number in rights else None,
         )
         samples.append(sample)
     return Clip(f"{folder.parent.name}/{folder.name}", "Virtual KITTI 2", tuple(samples))
@@ -78,7 +82,7 @@ def _find(path: Path, variant: str | None) -> Path:
 
 
 class _Table(dict[tuple[int, int], Matrix]):
-    """Matrices by frame and camera, which tell their file when one is missing."""
+    """Matrices by frame and camera; a missing one names their file."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -88,13 +92,27 @@ class _Table(dict[tuple[int, int], Matrix]):
         raise ValueError(f"{self.path}: has no line for frame {key[0]} of camera {key[1]}")
 
 
-def _right(image: ImageFile, number: int, cameras: _Table, poses: _Table) -> RightCamera:
-    return RightCamera(image, cameras[number, 1], poses[number, 1] @ calibration.invert(poses[number, 0]))
+class _Cameras(_Table):
+    """K by frame and camera, of images of NATIVE size."""
+
+    def fitted(self, frame: int, camera: int, size: tuple[int, int]) -> Matrix:
+        """K of images of ``size``.
+
+        Raises:
+            ValueError: there is no line for it, or the images can't be of this camera.
+        """
+        where = f"{self.path}: frame {frame} of camera {camera}"
+        return fit.fit_intrinsics(self[frame, camera], NATIVE, size, where)
 
 
-def _cameras(path: Path) -> _Table:
+def _right(image: ImageFile, number: int, cameras: _Cameras, poses: _Table) -> RightCamera:
+    K = cameras.fitted(number, 1, (image.height, image.width))
+    return RightCamera(image, K, poses[number, 1] @ calibration.invert(poses[number, 0]))
+
+
+def _cameras(path: Path) -> _Cameras:
     """K [3, 3]."""
-    cameras = _Table(path)
+    cameras = _Cameras(path)
     for frame, camera, *numbers in files.read_rows(path, (6,), skip=1).tolist():
         K = calibration.intrinsics(*numbers)
         calibration.check_intrinsics(K, f"{path}: frame {frame:.0f}")

@@ -1,5 +1,6 @@
 """What can be known of a clip's frames without a network: depth, own motion, masks, layers, things. Kept by frame."""
 
+import logging
 import math
 import threading
 import time
@@ -36,6 +37,8 @@ _DENSE: Final = 0.3
 #: Results of so many frames before the last one asked for are kept; a forecast looks at three.
 _KEPT: Final = 4
 
+_LOG: Final = logging.getLogger(__name__)
+
 Result = TypeVar("Result")
 
 
@@ -59,7 +62,8 @@ class Perception:
     `Perception`; one computes at a time.
 
     ``seconds`` tells the time by stage. Depth comes from the clip (scans are densified), else from its stereo pair,
-    else from motion; masks from labels, else from motion.
+    else from motion; masks from labels, else from motion. A depth map without a valid pixel is as a missing one, and
+    is logged.
     """
 
     def __init__(self, clip: Clip, progress: Callable[[str], None] | None = None) -> None:
@@ -69,6 +73,7 @@ class Perception:
         self._kept: dict[tuple[str, int], Any] = {}
         self._inner = 0.0
         self._lock = threading.RLock()
+        self._empty: set[int] = set()
 
     def image(self, index: int) -> NDArray[np.float32]:
         """[3, H, W]."""
@@ -99,7 +104,7 @@ class Perception:
     def inverse_std(self, index: int) -> float:
         """Standard deviation of 1 / depth, 1/m."""
         sample = self.clip[index]
-        if sample.depth is not None or sample.right is None:
+        if sample.right is None or self._given_depth(index) is not None:
             return _INVERSE_STD
         return _DISPARITY_STD / -float(sample.K[0, 0] * sample.right.right_from_left[0, 3])
 
@@ -125,20 +130,43 @@ class Perception:
             self._inner = outer + taken
 
     def _depth(self, index: int) -> NDArray[np.float32]:
-        sample = self.clip[index]
-        if sample.depth is not None:
-            depth = sample.read_depth().copy()
+        sample, depth = self.clip[index], self._given_depth(index)
+        if depth is not None:
             return depth if (depth > 0).mean() >= _DENSE else densify(depth, self.image(index), sky=self._sky(index))
         if sample.right is None:
             return self._from_motion(index).depth
         focal = -float(sample.K[0, 0] * sample.right.right_from_left[0, 3])
         searched = min(math.ceil(focal / _NEAREST), sample.width // 2)
-        pair = self.image(index), sample.right.read_image()
+        pair = self.image(index), sample.right.read_as(sample.K, sample.height, sample.width)
         rig = sample.right.right_from_left
         return stereo_depth(*pair, sample.K, rig, max_disparity=searched, fill=False)
 
+    def _given_depth(self, index: int) -> NDArray[np.float32] | None:
+        """The clip's own depth [1, H, W] m, 0 = invalid; None where it has none, or a map without a valid pixel."""
+        key = ("given depth", index)
+        with self._lock:
+            if key not in self._kept:
+                self._kept[key] = self._read_depth(index)
+            return self._kept[key]
+
+    def _read_depth(self, index: int) -> NDArray[np.float32] | None:
+        sample = self.clip[index]
+        if sample.depth is None:
+            return None
+        depth = sample.read_depth()
+        if (depth > 0).any():
+            return depth.copy()
+        if index not in self._empty:
+            self._empty.add(index)
+            file = getattr(sample.depth, "path", None) or "its depth"
+            instead = "motion" if sample.right is None else "the stereo pair"
+            _LOG.warning(
+                "%s: frame %s: %s has no valid depth; it comes from %s", self.clip.name, sample.name, file, instead
+            )
+        return None
+
     def _is_monocular(self, index: int) -> bool:
-        return self.clip[index].depth is None and self.clip[index].right is None
+        return self.clip[index].right is None and self._given_depth(index) is None
 
     def _from_motion(self, index: int) -> MotionDepth:
         if len(self.clip) < 2:
@@ -183,7 +211,8 @@ class Perception:
         velocity = np.zeros_like(layers.image)
         if index > 0:
             before = self.raw_depth(index - 1)
-            if self._is_monocular(index):  # two depths whose scales may differ by more than a thing moves
+            # Two depths whose scales may differ by more than an object moves.
+            if self._is_monocular(index) or self._is_monocular(index - 1):
                 before = np.zeros_like(before)
             measured = self.raw_depth(index), before, self.inverse_std(index)
             motion = self.correspondence(index), self.prev_from_cur(index), sample.K
