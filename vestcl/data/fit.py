@@ -133,8 +133,9 @@ def _unknown_size(K: Matrix) -> str:
 def _mismatch(K: Matrix, calibrated: Size, size: Size, where: str, place: str) -> str:
     sx, sy = size[1] / calibrated[1], size[0] / calibrated[0]
     cut = f"cx = {K[0, 2] - 0.5:.6g} - columns cut off at the left, cy = {K[1, 2] - 0.5:.6g} - rows cut off at the top"
+    resized = camera_json(scaled(K, calibrated, size), size)
     return (
         f"{where}: is for pictures of {calibrated} (height, width), but they are {size}: {sx:.4f} of the width and "
-        f"{sy:.4f} of the height. {place} {camera_json(scaled(K, calibrated, size), size)} if they were resized; if they were "
-        f"cropped, with fx = {K[0, 0]:.6g}, fy = {K[1, 1]:.6g}, {cut}"
+        f"{sy:.4f} of the height. {place} {resized} if they were resized; if they were cropped, "
+        f"with fx = {K[0, 0]:.6g}, fy = {K[1, 1]:.6g}, {cut}"
     )
