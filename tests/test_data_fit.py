@@ -237,6 +237,19 @@ def test_folders_that_can_not_be(tmp_path: Path, camera: dict[str, object], mess
         open_folder(test_data_folder.folder(tmp_path, **camera))
 
 
+def test_a_folder_with_published_numbers(tmp_path: Path) -> None:
+    """KITTI's K without its size, images of 0.82 of it: near enough to the middle, and wrong."""
+    numbers = {"fx": 721.5377, "fy": 721.5377, "cx": 609.5593, "cy": 172.854}
+    path = test_data_folder.folder(tmp_path, **numbers)
+    write_pictures(path / "image", ["a.png", "b.png", "c.png"], 309, 1024)
+    with pytest.raises(ValueError, match=r"camera\.json: is for pictures of \(375, 1242\)") as error:
+        open_folder(path)
+    K = settled(str(error.value), tmp_path / "settled", (309, 1024))[0].K
+    np.testing.assert_allclose(K, scaled(KITTI, 1024 / 1242, 309 / 375), atol=1e-3)
+    write_text(path / "camera.json", json.dumps(numbers | {"width": 1242, "height": 375}))
+    np.testing.assert_allclose(open_folder(path)[0].K, scaled(KITTI, 1024 / 1242, 309 / 375))
+
+
 def test_off_the_middle_where_the_size_is_stated(tmp_path: Path) -> None:
     path = test_data_folder.folder(tmp_path, cx=6.5, cy=0.5, width=8, height=6)
     assert open_folder(path)[0].K[:2, 2].tolist() == [7, 1]

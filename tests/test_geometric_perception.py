@@ -1,10 +1,12 @@
 """vestcl.geometric.perception: what is seen on a street, where it comes from, and what is kept how long."""
 
 import itertools
+import logging
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,8 +14,8 @@ import numpy as np
 import pytest
 from geometric_scenes import HEIGHT, WIDTH, drive
 
-from vestcl.data.sample import Clip, Sample
-from vestcl.data.sources import DepthArray
+from vestcl.data.sample import Clip, RightCamera, Sample
+from vestcl.data.sources import DepthArray, DepthFile, ImageArray
 from vestcl.geometric.perception import Perception
 from vestcl.scene.layers import SKY_DEPTH
 
@@ -253,6 +255,45 @@ def test_no_depth_and_no_second_camera_takes_motion() -> None:
     assert (depth > 0).all() and np.corrcoef(np.log(depth[near]), np.log(truth[near]))[0, 1] > 0.6
     assert Perception(clip).prev_from_cur(FRAME)[2, 3] > 0.3  # the frame before was behind
     assert Perception(clip).raw_depth(0).shape == depth.shape
+
+
+@pytest.mark.parametrize("pair", [True, False])
+def test_a_map_without_a_valid_pixel_is_as_a_missing_one(pair: bool, caplog: pytest.LogCaptureFixture) -> None:
+    clip = drive(4).clip if pair else without(drive(4).clip, "right")
+    empty = DepthArray(np.zeros((1, HEIGHT, WIDTH), np.float32))
+    blind = [replace(s, depth=empty) if i == FRAME else s for i, s in enumerate(clip)]
+    missing = [replace(s, depth=None) if i == FRAME else s for i, s in enumerate(clip)]
+    given, wanted = (Perception(replace(clip, samples=tuple(samples))) for samples in (blind, missing))
+    with caplog.at_level(logging.WARNING):
+        assert np.array_equal(given.seen(FRAME).layers.depth, wanted.seen(FRAME).layers.depth)
+        assert np.array_equal(given.raw_depth(FRAME - 1), wanted.raw_depth(FRAME - 1))
+    instead = "the stereo pair" if pair else "motion"
+    said = f"{clip.name}: frame {clip[FRAME].name}: its depth has no valid depth; it comes from {instead}"
+    assert caplog.messages == [said] and given.inverse_std(FRAME) == wanted.inverse_std(FRAME)
+
+
+def test_a_map_without_a_valid_pixel_is_named_by_its_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "scan.npy"
+    np.save(path, np.zeros((HEIGHT, WIDTH), np.float32))
+    clip = drive(4).clip
+    samples = tuple(replace(sample, depth=DepthFile(path)) for sample in clip)
+    with caplog.at_level(logging.WARNING):
+        Perception(replace(clip, samples=samples)).raw_depth(1)
+    assert f"frame {clip[1].name}: {path} has no valid depth; it comes from the stereo pair" in caplog.text
+
+
+def test_a_right_camera_with_other_intrinsics() -> None:
+    """A right image without its first columns and rows, at another scale: the same depth from the pair."""
+    clip = without(drive(4).clip, "depth", "labels")
+    right = clip[FRAME].right
+    assert right is not None
+    image = right.read_image()[:, 4:, 10:]
+    cut = RightCamera(ImageArray(image), right.K - [[0, 0, 10], [0, 0, 4], [0, 0, 0]], right.right_from_left)
+    other = replace(clip, samples=tuple(replace(s, right=cut) if i == FRAME else s for i, s in enumerate(clip)))
+    expected, found = (Perception(c).raw_depth(FRAME)[0, 8:, 24:] for c in (clip, other))
+    both = (expected > 0) & (found > 0)
+    assert both.mean() > 0.5 * (expected > 0).mean()
+    assert np.median(np.abs(found[both] / expected[both] - 1)) < 0.02
 
 
 def test_one_frame_alone_has_no_depth() -> None:

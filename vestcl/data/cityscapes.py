@@ -32,6 +32,9 @@ FPS: Final = 17.0
 #: Metres between two cameras of one car, at most.
 LONGEST_BASELINE: Final = 100.0
 
+#: Bytes of the largest camera file that is read.
+_LARGEST: Final = 1 << 20
+
 _FRAMES: Final = "leftImg8bit_sequence"
 _NAME: Final = re.compile(r"([a-z-]+)_(\d{6})_(\d{6})(?:_leftImg8bit(?i:\.png))?", re.ASCII)
 
@@ -173,7 +176,7 @@ def _parts(name: str) -> tuple[str, str, int]:
 
 
 def _read_camera(path: Path) -> _Camera:
-    encoded = read_bytes(path)
+    encoded = read_bytes(path, _LARGEST)
     try:
         content = parse_json(encoded)
         inner = content["intrinsic"]

@@ -282,8 +282,10 @@ class Calibration:
         """`split_projection` of the 3x4 entry ``name``.
 
         Raises:
-            ValueError: it is not there, or its K is no camera.
+            ValueError: it is not there, its K is no camera, or its shift is no camera's.
         """
         matrix = self.entry(name, 12).reshape(3, 4)
         check_intrinsics(matrix[:, :3], f"{self.path}: `{name}`")
-        return split_projection(matrix)
+        K, cam_from_rect0 = split_projection(matrix)
+        check_rigid(cam_from_rect0, f"{self.path}: `{name}`")
+        return K, cam_from_rect0

@@ -2,7 +2,8 @@
 
 Both sizes known, K becomes diag(sx, sy, 1) K with each axis by its own factor, if the two factors agree within 1 %: a
 resize rounds each side on its own (KITTI at 640 x 192: 0.5153 and 0.5120). Other proportions are a crop, or images of
-another kind. Where the calibration does not state its size, its principal point has to be near the middle.
+another kind. Where the calibration does not state its size, it is not scaled: KITTI's published numbers are for their
+own size only, and any other principal point has to be near the middle.
 """
 
 import json
@@ -54,28 +55,17 @@ def fit_intrinsics(K: Matrix, calibrated: Size | None, size: Size, where: str, p
     """
     place = place or "A folder with the images in image/ and this camera.json settles it:"
     if calibrated is None:
+        known = KITTI_SIZES.get((round(K[0, 0], 4), round(K[0, 2] - 0.5, 4), round(K[1, 2] - 0.5, 4)))
+        if known not in (None, size):
+            assert known is not None
+            raise ValueError(_mismatch(K, known, size, where, place))
         check_camera(K, size, where, f"{place} {_unknown_size(K)}", near=True)
         return K
     if not same_proportions(calibrated, size):
         raise ValueError(_mismatch(K, calibrated, size, where, place))
     fitted = scaled(K, calibrated, size)
-    check_camera(fitted, size, where, f"{place} {_unknown_size(K)}", near=False)
+    check_camera(fitted, size, where, "Its cx and cy must be those of these images", near=False)
     return fitted
-
-
-def fit_kitti(K: Matrix, size: Size, where: str) -> Matrix:
-    """K of a KITTI calibration file that does not state its size, if it is for images of ``size``.
-
-    Raises:
-        ValueError: K is a published one of another size, or can't be for these images.
-    """
-    known = KITTI_SIZES.get((round(K[0, 0], 4), round(K[0, 2] - 0.5, 4), round(K[1, 2] - 0.5, 4)))
-    if known in (None, size):
-        return fit_intrinsics(K, known, size, where)
-    assert known is not None
-    raise ValueError(
-        _mismatch(K, known, size, where, "A folder with the images in image/ and this camera.json settles it:")
-    )
 
 
 def same_proportions(one: Size, other: Size) -> bool:

@@ -77,7 +77,7 @@ def _camera(camera: int, size: tuple[int, int], cameras: Calibration) -> tuple[M
     """K of images of ``size``, and cam_from_cam0. calib.txt does not state a size, so that K is not scaled."""
     name = f"P{camera}"
     K, cam_from_cam0 = cameras.projection(name)
-    return fit.fit_kitti(K, size, f"{cameras.path}: `{name}`"), cam_from_cam0
+    return fit.fit_intrinsics(K, None, size, f"{cameras.path}: `{name}`"), cam_from_cam0
 
 
 def _rights(

@@ -141,8 +141,6 @@ def _camera(drive: Path, camera: int, size: tuple[int, int], cameras: Calibratio
             f"{where}: is for rectified images, but those of {drive}, {size} (height, width), are as they were "
             f"recorded; open the drive's _sync folder{_recorded_camera(camera, cameras)}"
         )
-    if calibrated is None:
-        return fit.fit_kitti(K, size, where), cam_from_rect0
     return fit.fit_intrinsics(K, calibrated, size, where), cam_from_rect0
 
 
@@ -178,7 +176,13 @@ def _poses(drive: Path, frames: list[int], cam_from_rect0: Matrix, cameras: Cali
     imu_from_cam = calibration.invert(cam_from_rect0 @ _rect0_from_velo(drive, cameras) @ velo_from_imu)
     rows = [files.read_rows(folder / f"{frame:010}.txt", (OXTS_NUMBERS,))[0] for frame in frames]
     scale = float(np.cos(np.radians(rows[0][0])))
-    return [mercator_pose(row, scale) @ imu_from_cam for row in rows]
+    poses: list[Matrix | None] = []
+    for frame, row in zip(frames, rows, strict=True):
+        with np.errstate(invalid="ignore"):  # of latitudes beyond the poles
+            pose = mercator_pose(row, scale) @ imu_from_cam
+        calibration.check_rigid(pose, str(folder / f"{frame:010}.txt"))
+        poses.append(pose)
+    return poses
 
 
 def _rect0_from_velo(drive: Path, cameras: Calibration) -> Matrix:

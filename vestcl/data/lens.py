@@ -77,7 +77,7 @@ class Lens:
         """
         if max(size) > _LONGEST:
             raise ValueError(f"{where}: images with distortion must have at most {_LONGEST} px a side, got {max(size)}")
-        lens = cls((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), *size, distortion)
+        lens = cls(_numbers(K), *size, distortion)
         share = float(lens.at(64, 64).outside().mean())
         if share > _MOST_OUTSIDE:
             why = f"undistorted, {share:.0%} of the image would be outside the recorded one"
@@ -87,7 +87,7 @@ class Lens:
     def at(self, height: int, width: int) -> "Lens":
         """The same lens, for the same image at another size."""
         K = fit.scaled(calibration.intrinsics(*self.K), (self.height, self.width), (height, width))
-        return Lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), height, width, self.distortion)
+        return Lens(_numbers(K), height, width, self.distortion)
 
     def undistort(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """[3, H, W] as recorded -> [3, H, W], bilinear; black where the recorded image shows nothing."""
@@ -209,6 +209,10 @@ def undistorted_labels(source: LabelSource | None, lens: Lens | None) -> LabelSo
 def lens_of(image: ImageSource) -> Lens | None:
     """The lens that an image is undistorted by, if any: other maps of the recorded image need it, too."""
     return image.lens if isinstance(image, UndistortedImage) else None
+
+
+def _numbers(K: calibration.Matrix) -> tuple[float, float, float, float]:
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
 @functools.lru_cache(maxsize=4)

@@ -92,4 +92,4 @@ def read_bytes(path: str | Path, limit: int = LARGEST) -> bytes:
 
 
 def _without_blocking(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NONBLOCK)
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
