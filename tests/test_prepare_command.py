@@ -132,7 +132,7 @@ def test_one_clips_failure_stops_no_other(folder: Path, tmp_path: Path, capsys: 
     picture = max((folder / "image").iterdir())
     picture.write_bytes(picture.read_bytes()[:500])
     lonely = tmp_path / "lonely"
-    write_pixels(lonely / "image" / "0.png", np.zeros((8, 8, 3), np.uint8))
+    write_pixels(lonely / "image" / "0.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     write_text(lonely / "camera.json", (folder / "camera.json").read_text())
     plain = options(str(lonely), str(folder), "street:5", out=tmp_path / "cache")
     with pytest.raises(ValueError, match=r"lonely: must have 2 frames or more, got 1.*\n.*is no image"):

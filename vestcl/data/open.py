@@ -142,8 +142,6 @@ def _with_labels(clip: Clip, where: Path, label_ids: LabelKind) -> Clip:
 
 def _named(where: Path, clip: Clip, suffixes: tuple[str, ...]) -> dict[str, Path]:
     """A file for each frame."""
-    if not where.is_dir():
-        raise ValueError(f"{where}: no such folder")
     found = by_name(where, suffixes)
     for sample in clip:
         if sample.name not in found:
