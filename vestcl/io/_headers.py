@@ -52,7 +52,7 @@ def checked_size(path: str | Path, content: bytes) -> tuple[int, int]:
         else:
             size = _other_size(content)
     except (_DamagedError, struct.error) as error:
-        raise ValueError(f"{path}: is no image, or a damaged one ({error})") from error
+        raise ValueError(f"{path}: is no image, or a damaged one") from error
     check_size(path, *size)
     return size
 
@@ -80,7 +80,7 @@ def check_whole(path: str | Path, content: bytes) -> None:
         elif content.startswith(_JPEG):
             _check_jpeg(content)
     except (_DamagedError, struct.error) as error:
-        raise ValueError(f"{path}: is no image, or a damaged one ({error})") from error
+        raise ValueError(f"{path}: is no image, or a damaged one") from error
 
 
 class _DamagedError(Exception):

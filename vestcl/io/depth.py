@@ -59,7 +59,9 @@ def read_depth(
         values = _read_npy(path)
     else:
         raise ValueError(f"{path}: a depth file must end in .png, .exr or .npy")
-    return _known(values.astype(np.float64) / (units_per_metre or 1.0))
+    with np.errstate(invalid="ignore"):  # of a signalling NaN
+        metres = values.astype(np.float64)
+    return _known(metres / (units_per_metre or 1.0))
 
 
 def read_cityscapes_disparity(path: str | Path, baseline: float, fx: float) -> NDArray[np.float32]:

@@ -32,11 +32,11 @@ def read_pixels(path: str | Path, size: tuple[int, int] | None = None) -> Pixels
         ValueError: no such file, it can't be decoded, it is damaged, of another size, or has more than 2^26 pixels.
     """
     content = read_bytes(path)
+    check_whole(path, content)
     got = checked_size(path, content)
     if size not in (None, got):
         assert size is not None
         raise ValueError(f"{path}: must be {size[0]} x {size[1]} as its clip is, got {got[0]} x {got[1]}")
-    check_whole(path, content)
     try:
         pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:

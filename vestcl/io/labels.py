@@ -105,13 +105,13 @@ def read_ego_vehicle(path: str | Path) -> NDArray[np.bool_]:
 def _read_ids(path: str | Path) -> NDArray[np.uint8]:
     """The indices as stored: a palette, as some tools write one for looking at, is not applied."""
     content = read_bytes(path)
-    checked_size(path, content)
     check_whole(path, content)
+    checked_size(path, content)
     try:
         with Image.open(io.BytesIO(content)) as image:
             mode, ids = image.mode, np.array(image)
     except Exception as error:  # Pillow's plugins raise what their format's damage leads them to
-        raise ValueError(f"{path}: is no image, or a damaged one ({error})") from error
+        raise ValueError(f"{path}: is no image, or a damaged one") from error
     if mode not in ("L", "P"):
         raise ValueError(f"{path}: label ids must be an 8-bit image of one channel, got mode {mode}")
     return ids.astype(np.uint8, copy=False)
