@@ -202,7 +202,7 @@ def _add(digest: Any, value: Any) -> None:
     if isinstance(value, Path):
         digest.update(hashlib.sha256(read_bytes(value)).digest())
     elif isinstance(value, Video):
-        digest.update(_file_digest(value.path, *_version(value.path)))
+        digest.update(b"by presentation time" + _file_digest(value.path, *_version(value.path)))
     elif isinstance(value, np.ndarray):
         digest.update(f"{value.dtype}{value.shape}".encode())
         digest.update(np.ascontiguousarray(value))
