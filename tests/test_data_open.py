@@ -1,5 +1,6 @@
 """vestcl.data.open: the layout tells the reader; and vestcl.data.video."""
 
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import test_data_kitti_odometry
 import test_data_kitti_raw
 import test_data_virtual_kitti
 from data_files import picture, real, write_text
+from video_files import write_video
 
 from vestcl import io
 from vestcl.data.open import open_sequence
@@ -97,6 +99,19 @@ def test_video(tmp_path: Path) -> None:
         open_video(tmp_path / "drive.mp4", fov=200)
     with pytest.raises(ValueError, match="which takes fov, not rig"):
         open_sequence(tmp_path / "drive.mp4", rig="grey")
+
+
+@pytest.mark.parametrize("degrees", [0, 90])
+def test_a_video_with_oblong_pixels(tmp_path: Path, degrees: int) -> None:
+    """fy / fx is a pixel's width over its height; turned by a quarter, its height over its width. A resize scales."""
+    frames = [picture(32, 64, i) for i in range(3)]
+    clip = open_video(write_video(tmp_path / "a.mp4", frames, aspect=Fraction(5, 3), degrees=degrees), fov=90)
+    height, width, aspect = (64, 32, 3 / 5) if degrees else (32, 64, 5 / 3)
+    expected = np.array([[width / 2, 0, width / 2], [0, aspect * width / 2, height / 2], [0, 0, 1]])
+    np.testing.assert_allclose(clip[0].K, expected)
+    resized = clip.resized(16, 100)[1]
+    np.testing.assert_allclose(resized.K, np.diag([100 / width, 16 / height, 1]) @ expected)
+    assert resized.read_image().shape == (3, 16, 100)
 
 
 def test_pictures_without_a_camera(tmp_path: Path) -> None:

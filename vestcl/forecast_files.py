@@ -32,7 +32,7 @@ from vestcl.forecast import Forecast, Rendered, View
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.io.exr import ExrFrame, read_exr_frame, write_exr_frame
 from vestcl.io.images import read_image, to_pixels, write_image, write_pixels
-from vestcl.io.video import write_gif, write_mp4
+from vestcl.io.video_writing import write_gif, write_mp4
 from vestcl.sheet import Picture
 from vestcl.views import check_name, seen_by
 
@@ -239,7 +239,8 @@ def _write_videos(
     images = [*context, *(rendered.image for rendered in _of_view(forecast, view.name))]
     pixels = [to_pixels(image).astype(np.uint8, copy=False) for image in images]
     files: dict[str, Any] = {"context_frames": len(context), "video": f"{view.name}/forecast.mp4"}
-    write_mp4(out / files["video"], pixels, fps)
+    K = clip[index].K if view.K is None else view.K
+    write_mp4(out / files["video"], pixels, fps, pixel_aspect=K[1, 1] / K[0, 0])
     if gif:
         files["gif"] = f"{view.name}/forecast.gif"
         write_gif(out / files["gif"], pixels, fps)

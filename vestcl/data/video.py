@@ -1,4 +1,7 @@
-"""A video file without calibration: a pinhole camera of a stated field of view, principal point in the middle."""
+"""A video file without calibration: a pinhole camera of a stated field of view, principal point in the middle.
+
+Pixels are as wide and high as the file says (its sample aspect ratio a, width over height): fy = a fx.
+"""
 
 from pathlib import Path
 from typing import Final
@@ -17,7 +20,7 @@ def open_video(path: str | Path, fov: float = FOV) -> Clip:
     """A video's frames.
 
     Args:
-        path: any file that OpenCV's ffmpeg decodes.
+        path: any file that FFmpeg decodes.
         fov: horizontal field of view in degrees, between 0 and 180.
 
     Raises:
@@ -25,5 +28,6 @@ def open_video(path: str | Path, fov: float = FOV) -> Clip:
     """
     video = Video(path)
     K = intrinsics_from_fov(fov, video.height, video.width)
-    samples = (Sample(f"{i:06}", VideoFrame(video, i), K, timestamp=i / video.fps) for i in range(len(video)))
+    K[1, 1] *= video.pixel_aspect
+    samples = (Sample(f"{i:06}", VideoFrame(video, i), K, timestamp=float(t)) for i, t in enumerate(video.seconds))
     return Clip(Path(path).stem, "video", tuple(samples))
