@@ -42,6 +42,9 @@ class FakeClip:
     def __len__(self) -> int:
         return self.frames
 
+    def is_whole(self, index: int, steps: int) -> bool:
+        return index + steps < self.frames
+
     def frame(self, index: int) -> Prepared:
         self.touched.add(index)
         return prepared(index, MOTIONS[index % 2] if index else None)

@@ -128,13 +128,14 @@ def _driving(clips: Sequence[PreparedClip]) -> tuple[str, str]:
     speeds, turns = list[float](), list[float]()
     for clip in clips:
         poses = [clip.world_from_cam(index) for index in range(len(clip))]
-        for before, after in itertools.pairwise(poses):
-            if before is None or after is None or clip.fps is None:
+        for index, (before, after) in enumerate(itertools.pairwise(poses), start=1):
+            if before is None or after is None or clip.interval is None:
                 continue
+            seconds = clip.interval * clip.elapsed(index)
             motion = np.linalg.inv(before) @ after
             cosine = min(max((float(np.trace(motion[:3, :3])) - 1) / 2, -1.0), 1.0)
-            speeds.append(float(np.linalg.norm(motion[:3, 3])) * clip.fps)
-            turns.append(math.degrees(math.acos(cosine)) * clip.fps)
+            speeds.append(float(np.linalg.norm(motion[:3, 3])) / seconds)
+            turns.append(math.degrees(math.acos(cosine)) / seconds)
     return _range(speeds), _range(turns)
 
 

@@ -111,16 +111,18 @@ class WindowSet:
             longest = max(len(clip) for clip in self.clips)
             within = "" if self.frames is None else f" within frames {self.frames[0]} ... {self.frames[1]}"
             needed = _INPUTS + len(self.horizons)
-            raise ValueError(f"`clips` must have {needed} frames or more{within}, got {longest} in the longest clip")
+            wanted = f"{needed} frames or more{within} without a gap"
+            raise ValueError(f"`clips` must have {wanted}, got {longest} in the longest clip")
 
     @functools.cached_property
     def windows(self) -> list[tuple[int, int]]:
-        """(index of the clip, t), clip after clip."""
+        """(index of the clip, t), clip after clip; none with a gap, whose frames are not an interval apart."""
         found = []
         for number, clip in enumerate(self.clips):
             first, last = (0, len(clip) - 1) if self.frames is None else self.frames
             last = min(last, len(clip) - 1)
-            found += [(number, t) for t in range(max(first, 0) + _INPUTS - 1, last - len(self.horizons) + 1)]
+            chosen = range(max(first, 0) + _INPUTS - 1, last - len(self.horizons) + 1)
+            found += [(number, t) for t in chosen if clip.is_whole(t - 1, 1 + len(self.horizons))]
         return found
 
     def global_batch(self, seed: int, step: int, batch: int) -> list[Draw]:

@@ -94,7 +94,8 @@ class Part:
 
 
 def plan(sources: Iterable[Source], protocol: Protocol, steps: int, every: int, folder: Path, key: str) -> list[Part]:
-    """All parts, in the order of clips and windows; of all clips' windows counted through, every ``every``-th.
+    """All parts, in the order of clips and windows; of all clips' windows counted through, every ``every``-th. Windows
+    whose future has a gap are left out.
 
     Args:
         sources: clips.
@@ -105,17 +106,17 @@ def plan(sources: Iterable[Source], protocol: Protocol, steps: int, every: int, 
         key: of the settings.
 
     Raises:
-        ValueError: ``every`` below 1, or a clip that is too short for a single window.
+        ValueError: ``every`` below 1, or a clip that is too short for a single window, or has gaps in each.
     """
     if every < 1:
         raise ValueError(f"`every` must be 1 or more, got {every}")
     parts, count = list[Part](), 0
     for source in sources:
-        frames = len(source.opens())
-        known = currents(frames, steps, protocol.first, protocol.last)
+        clip = source.opens()
+        known = [t for t in currents(len(clip), steps, protocol.first, protocol.last) if clip.is_whole(t, steps)]
         if not known:
-            wanted = f"{(protocol.first or 1) + steps + 1} frames and a window from `first` to `last`"
-            raise ValueError(f"{source.name}: must have {wanted}, got {frames} frames")
+            wanted = f"{(protocol.first or 1) + steps + 1} frames and a window from `first` to `last` without a gap"
+            raise ValueError(f"{source.name}: must have {wanted}, got {len(clip)} frames")
         chosen = [t for number, t in enumerate(known, start=count) if number % every == 0]
         count += len(known)
         name = re.sub(r"[^A-Za-z0-9_.-]+", "_", source.name)

@@ -41,11 +41,11 @@ def repeat_last(frame_prev: torch.Tensor, frame_cur: torch.Tensor, steps: int) -
 
 
 def flow_extrapolation(
-    frame_prev: torch.Tensor, frame_cur: torch.Tensor, steps: int, follow: Follow = "place"
+    frame_prev: torch.Tensor, frame_cur: torch.Tensor, steps: int, follow: Follow = "place", *, elapsed: float = 1.0
 ) -> torch.Tensor:
     """I_(t+k)(p) = I_t(p + b_k(p)) with the motion b_k from t+k back to t at constant velocity.
 
-    f(p) is the flow from t to t-1 (OpenCV's DIS). What stays constant is a choice:
+    f(p) is the flow from t to t-1 (OpenCV's DIS), divided by ``elapsed``. What stays constant is a choice:
 
     - "place": the flow at each place of the image. b_1 = f, b_(k+1)(p) = b_k(p) + f(p + b_k(p)): a streamline is
       followed backwards. Nothing is left empty. It holds where a camera drives through a static scene, as what comes
@@ -62,20 +62,24 @@ def flow_extrapolation(
         frame_cur: [B, 3, H, W] in [0, 1], RGB, at t.
         steps: frames to forecast, 1 or more.
         follow: "place" or "point".
+        elapsed: intervals from t-1 to t; a step is one interval.
 
     Returns:
         [B, steps, 3, H, W]; no gradient.
 
     Raises:
-        ValueError: shapes don't fit, an image below FLOW_SIDE, no steps, or ``follow`` is neither word.
+        ValueError: shapes don't fit, an image below FLOW_SIDE, no steps, ``follow`` is neither word, or ``elapsed`` is
+            not above 0.
 
     Source: SPEC section 10; Kroeger et al., Fast Optical Flow using Dense Inverse Search, 2016.
     """
     _check(frame_prev, frame_cur, steps)
     if follow not in ("place", "point"):
         raise ValueError(f'`follow` must be "place" or "point", got {follow!r}')
+    if not elapsed > 0:
+        raise ValueError(f"`elapsed` must be above 0, got {elapsed}")
     with torch.no_grad():
-        prev_from_cur = optical_flow(frame_cur, frame_prev)
+        prev_from_cur = optical_flow(frame_cur, frame_prev) / elapsed
         back, frames = torch.zeros_like(prev_from_cur), []
         for step in range(1, steps + 1):
             if follow == "place":

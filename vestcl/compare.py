@@ -1,5 +1,6 @@
 """A forecast beside what then happened, and beside forecasts that need neither depth nor weights."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -57,7 +58,7 @@ def compare(
     trunk: Trunk | None = None,
     report: Callable[[float], None] | None = None,
 ) -> list[Comparison]:
-    """Score every view that a camera of the rig really saw, step by step as long as the clip goes on.
+    """Score every view that a camera of the rig really saw, step by step as long as the clip has a frame at that time.
 
     The baselines get the two last frames of the camera that they are held against: for the right camera its own, which
     the forecast has never seen. That makes them a bar to pass, not a rival of equal means.
@@ -80,6 +81,11 @@ def compare(
     """
     if not 1 <= index < len(clip) - 1:
         raise ValueError(f"`index` must have a frame before and after it, 1 ... {len(clip) - 2}, got {index}")
+    if not clip.after(index, 1):
+        after = clip.positions[index + 1] - clip.positions[index]
+        raise ValueError(
+            f"`index` must have a frame one interval after it; after {index} there is none for {after:.3g}"
+        )
     known = [view for view in views if seen_by(view, clip[index]) is not None]
     if not known:
         raise ValueError('`views` must have one with a truth to compare with: "source", or "right" of a stereo clip')
@@ -117,10 +123,12 @@ def comparison_sheet(comparison: Comparison, title: str = "") -> Picture:
 
 
 def _compare_view(forecast: Forecast, clip: Clip, index: int, view: View, trunk: Trunk | None) -> Comparison:
-    steps = min(len(forecast.frames), len(clip) - 1 - index)
-    previous, current, *truth = (_read(view, clip[at]) for at in range(index - 1, index + steps + 1))
+    later = clip.after(index, len(forecast.frames))
+    steps = len(later)
+    previous, current, *truth = (_read(view, clip[at]) for at in (index - 1, index, *later))
     images = {FORECAST: [frame[view.name].image for frame in forecast.frames[:steps]]}
-    for name, forecaster in ((REPEAT, baselines.repeat_last), (FLOW, baselines.flow_extrapolation)):
+    flow = functools.partial(baselines.flow_extrapolation, elapsed=clip.elapsed(index))
+    for name, forecaster in ((REPEAT, baselines.repeat_last), (FLOW, flow)):
         images[name] = list(forecaster(_batch(previous), _batch(current), steps)[0].numpy())
     scores = {
         method: [_scores(image, wanted, trunk) for image, wanted in zip(of_method, truth, strict=True)]

@@ -69,3 +69,5 @@ class Forecast:
     """A network's seconds by stage; they are in ``seconds``, too, as one number."""
     skipped: dict[str, Skipped] = field(default_factory=dict)
     """By switch of `vestcl.models.skipping.Skip`."""
+    notes: tuple[str, ...] = ()
+    """Lines for the user: what was left out, and why."""

@@ -133,7 +133,8 @@ def open_clip(options: "cli.Forecast") -> Clip:
 def current_frame(clip: Clip, options: "cli.Forecast") -> int:
     """The index t of the last frame that the forecast may see.
 
-    Without ``frame`` the clip's last one; to compare, the last one with ``steps`` true frames after it.
+    Without ``frame`` the clip's last one; to compare, the last one with a true frame at each of ``steps`` intervals
+    after it.
 
     Raises:
         ValueError: no such frame, none before it, or none after it to compare with.
@@ -141,9 +142,13 @@ def current_frame(clip: Clip, options: "cli.Forecast") -> int:
     last = len(clip) - 1
     index = options.frame
     if index is None:
-        index = last - options.steps if options.compare else last
+        whole = (
+            i for i in range(last, 0, -1) if not options.compare or len(clip.after(i, options.steps)) == options.steps
+        )
+        index = next(whole, 0)
         if index < 1:
             wanted = f"{options.steps + 2} frames to compare {options.steps} steps" if options.compare else "2 frames"
+            wanted += " without a gap" if last > options.steps else ""
             raise ValueError(f"{options.input}: must have {wanted}, got {last + 1}")
     highest = last - 1 if options.compare else last
     if not 1 <= index <= highest:
@@ -286,6 +291,8 @@ def _print_end(console: Console, saved: forecast_files.SavedForecast) -> None:
             console.print(
                 Text(f"skipped, {switch}: {Skipped(*(one[name] for name in Skipped._fields))}"), soft_wrap=True
             )
+    for note in saved.about.get("notes", []):
+        console.print(Text(f"note: {note}"), soft_wrap=True)
     for view in saved.about["views"].values():
         for path in _paths(view):
             console.print(Text(str(saved.folder / path)), soft_wrap=True)

@@ -32,7 +32,7 @@ from vestcl.forecast import Forecast, Rendered, View
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.io.exr import ExrFrame, read_exr_frame, write_exr_frame
 from vestcl.io.images import read_image, to_pixels, write_image, write_pixels
-from vestcl.io.video_writing import write_gif, write_mp4
+from vestcl.io.video_writing import encoder_note, write_gif, write_mp4
 from vestcl.sheet import Picture
 from vestcl.views import check_name, seen_by
 
@@ -257,11 +257,13 @@ def _about(forecast: Forecast, clip: Clip, index: int, details: Details) -> dict
         "height": sample.height,
         "width": sample.width,
         "fps": clip.fps or FPS,
+        "interval_s": clip.interval,
         "method": forecast.method,
         "steps": len(forecast.frames),
         "K": sample.K,
         "future_from_cur": forecast.future_from_cur,
         "settings": dict(details.settings),
+        "notes": [*forecast.notes, *([note] if (note := encoder_note()) else [])],
         **machine(),
     }
     if forecast.profile:

@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, Skipped, View
+from vestcl.geometric.forecast import gap_notes
 from vestcl.geometric.perception import Perception
+from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster, Mode, RenderedView
 from vestcl.models.skipping import Count, Tally, count_skips
 from vestcl.network_input import NetworkInput, last_motions, network_input
 from vestcl.prepared import prepare_frame
 from vestcl.stages import watching, with_rest
+from vestcl.times import is_same
 
 Progress = Callable[[str, float], None]
 
@@ -88,7 +91,7 @@ def forecast_frames(
         raise ValueError(f"`index` must be 1 ... {len(clip) - 1}, a frame of {clip.name} with one before, got {index}")
     if steps < 1 or not views:
         raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
-    given = _given(perception, index)
+    given, note = _given(perception, index, model.config)
     tell("network")
     start = time.perf_counter()
     with torch.inference_mode(), watching() as watch, count_skips() as tally:
@@ -102,7 +105,9 @@ def forecast_frames(
     whole = time.perf_counter() - start
     profile = with_rest(watch.take(), whole)
     skipped = what_was_skipped(tally, profile)
-    return Forecast(model.config.name, motions, frames, perception.seconds | {"network": whole}, profile, skipped)
+    seconds = perception.seconds | {"network": whole}
+    notes = (*gap_notes(perception, index), *([] if note is None else [note]))
+    return Forecast(model.config.name, motions, frames, seconds, profile, skipped, notes)
 
 
 def what_was_skipped(tally: Tally, profile: Mapping[str, float]) -> dict[str, Skipped]:
@@ -138,16 +143,41 @@ def show_frame(perception: Perception, model: Forecaster, index: int, views: Seq
         index: the frame t, 1 or more.
         views: cameras at t, ``tgt_from_next`` from the source camera there.
     """
-    given = _given(perception, index)
+    given, _ = _given(perception, index, model.config)
     prior = given.prior if model.config.start == "prior" else None
     with torch.inference_mode():
         shown = model.present(given.frame_prev, given.frame_cur, given.K, cameras(views, given), prior)
     return dict(zip((view.name for view in views), map(_rendered, shown), strict=True))
 
 
-def _given(perception: Perception, index: int) -> NetworkInput:
+def _given(perception: Perception, index: int, config: ModelConfig) -> tuple[NetworkInput, str | None]:
+    """The two frames, and a line on the interval where it is another one than the network learned at."""
     prev, cur = prepare_frame(perception, index - 1), prepare_frame(perception, index)
-    return network_input(prev, cur, last_motions(prev, cur))
+    given, note = network_input(prev, cur, last_motions(prev, cur)), interval_note(perception.clip, index, config)
+    return given._replace(prior=given.prior._replace(corrected=torch.tensor([note is None]))), note
+
+
+def interval_note(clip: Clip, index: int, config: ModelConfig) -> str | None:
+    """Why motion networks are not used at this frame: they learned at another interval than the clip's, or than the one
+    from t - 1 to t. None where they are used.
+
+    Args:
+        clip: of the frame; without timestamps its interval counts as the network's.
+        index: of the frame t, 1 or more.
+        config: of the network; with ``start`` "rest" its motion can't be left out, and is only doubtful.
+    """
+    if clip.interval is None:
+        return None
+    gap = clip.interval * clip.elapsed(index)
+    wrong = next((seconds for seconds in (gap, clip.interval) if not is_same(seconds, config.interval_s)), None)
+    if wrong is None:
+        return None
+    if config.start == "prior":
+        consequence = "its corrections of the camera's and the objects' motion are left out"
+    else:
+        consequence = "its motion may be wrong"
+    what = "frames t-1 and t are" if wrong == gap != clip.interval else "frames are"
+    return f"{what} {wrong:.3g} s apart, {config.name} learned at {config.interval_s:g} s: {consequence}"
 
 
 def cameras(views: Sequence[View], given: NetworkInput) -> list[tuple[torch.Tensor, torch.Tensor]]:

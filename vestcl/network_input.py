@@ -33,16 +33,17 @@ class NetworkInput(NamedTuple):
 def network_input(prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.float64]]) -> NetworkInput:
     """Two prepared frames with their motion prior: constant velocity, of the camera and of all that moves beside it.
 
-    next_from_cur = constant_velocity(motions), and the last two motions as they are. What moves, moves by its own
-    velocity v in the axes of its frame: the networks take it to R (x + n v) + t after n intervals. The recording car's
-    own bonnet does not move in the picture, so there x = R (x + n v) + t, which gives v = (R^-1 (x - t) - x) / n: n = 2
-    intervals from t - 1, and 1 from t.
+    next_from_cur = constant_velocity(motions) over one interval of the clip, and the last two motions as they are. What
+    moves, moves by its own velocity v in the axes of its frame: the networks take it to R (x + n v) + t after n
+    intervals. The recording car's own bonnet does not move in the picture, so there x = R (x + n v) + t, which gives
+    v = (R^-1 (x - t) - x) / n: n = 1 interval from t, and ``cur.elapsed`` more from t - 1.
 
     Args:
         prev: the frame at t - 1.
         cur: the frame at t, of the same size and camera.
         motions: ``cur_from_prev`` [4, 4] m of the last consecutive frames, oldest first; the last one is from ``prev``
-            to ``cur``. One or two are usual, see `last_motions`.
+            to ``cur``, over ``cur.elapsed`` intervals, the one before over ``prev.elapsed``, others over one. One or
+            two are usual, see `last_motions`.
 
     Returns:
         The input with B = 1; tensors of their own memory.
@@ -58,14 +59,18 @@ def network_input(prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.fl
     if not np.allclose(prev.K, cur.K):
         raise ValueError(f"`prev` and `cur` must have one K, got {prev.K.tolist()} and {cur.K.tolist()}")
     motions = [_check.matrix("motions", motion, 4) for motion in motions]
-    next_from_cur = constant_velocity(motions)
+    elapsed = [1.0] * len(motions)
+    elapsed[-2:] = [prev.elapsed, cur.elapsed][-len(motions) :]
+    next_from_cur = constant_velocity(motions, elapsed)
     next_from_prev = next_from_cur @ motions[-1]
     prior = MotionPrior(
         as_motion(next_from_cur),
         as_motion(motions[-1]),
         as_motion(motions[-2] if len(motions) > 1 else motions[-1]),
-        torch.from_numpy(_velocity(prev, next_from_prev, 2)[None]),
+        torch.from_numpy(_velocity(prev, next_from_prev, 1 + cur.elapsed)[None]),
         torch.from_numpy(_velocity(cur, next_from_cur, 1)[None]),
+        torch.tensor([1 + cur.elapsed]),
+        torch.tensor([True]),
     )
     return NetworkInput(batch([prev.layers]), batch([cur.layers]), torch.from_numpy(cur.K[None]).float(), prior)
 
@@ -89,8 +94,8 @@ def as_motion(dst_from_src: NDArray[np.float64]) -> RigidMotion:
     return RigidMotion(geometry.matrix_to_quaternion(rigid[:, :3, :3]).float(), rigid[:, :3, 3].float())
 
 
-def _velocity(frame: Prepared, next_from_src: NDArray[np.float64], intervals: int) -> NDArray[np.float32]:
-    """[3, H, W] m a frame interval: the frame's, but the recording car stays where it is in the picture."""
+def _velocity(frame: Prepared, next_from_src: NDArray[np.float64], intervals: float) -> NDArray[np.float32]:
+    """[3, H, W] m per interval: the frame's, but the recording car stays where it is in the picture."""
     if not frame.own.any():
         return np.array(frame.velocity, np.float32)
     y, x = np.nonzero(frame.own[0])

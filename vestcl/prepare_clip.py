@@ -180,8 +180,12 @@ def frame_keys(clip: Clip, estimators: str = "") -> list[str]:
     keys = []
     for index in range(len(clip)):
         # The first frame has none before it, so that its depth may be from its motion to the second.
-        seen = samples[:2] if index == 0 else samples[max(index - LOOKS_BACK, 0) : index + 1]
+        first = max(index - LOOKS_BACK, 0)
+        seen = samples[:2] if index == 0 else samples[first : index + 1]
         key = hashlib.sha256(f"{RECIPE}|{index == 0}|{estimators}".encode())
+        elapsed = [clip.elapsed(before) for before in range(first, index + 1)]
+        if set(elapsed) != {1.0}:  # velocities are per interval, and long gaps are not matched
+            key.update(f"|{elapsed} intervals".encode())
         for digest in seen:
             key.update(digest)
         keys.append(key.hexdigest())

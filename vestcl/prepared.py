@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from vestcl import times
 from vestcl.geometric.perception import Perception
 from vestcl.io.atomic import read_bytes
 from vestcl.prepared_files import JSON, RECIPE, REMEDY, read_tensors
@@ -32,11 +33,13 @@ class Prepared:
     """[3, 3] px."""
     layers: Layers
     velocity: NDArray[np.float32]
-    """[3, H, W] m a frame interval, in the camera's axes at t, of what moves beside the camera; else 0."""
+    """[3, H, W] m per interval of the clip, in the camera's axes at t, of what moves beside the camera; else 0."""
     own: NDArray[np.bool_]
     """[1, H, W], True where the recording car itself is in the picture; it moves with the camera."""
     prev_from_cur: NDArray[np.float64] | None
     """[4, 4] m, the camera's motion to the frame before; None for a clip's first frame."""
+    elapsed: float = 1.0
+    """Intervals of the clip since the frame before; 1 for a clip's first frame."""
 
 
 def prepare_frame(perception: Perception, index: int) -> Prepared:
@@ -51,7 +54,8 @@ def prepare_frame(perception: Perception, index: int) -> Prepared:
     """
     seen, sample = perception.seen(index), perception.clip[index]
     motion = perception.prev_from_cur(index) if index > 0 else None
-    return Prepared(sample.name, sample.K, seen.layers, seen.velocity, seen.own, motion)
+    elapsed = perception.clip.elapsed(index)
+    return Prepared(sample.name, sample.K, seen.layers, seen.velocity, seen.own, motion, elapsed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +76,13 @@ class PreparedClip:
     name: str
     kind: str
     """The reader it comes from, "KITTI raw"."""
-    fps: float | None
-    """Frames a second, None if not known."""
+    interval: float | None
+    """Seconds, the median from frame to frame; None if not known."""
     size: tuple[int, int]
     """(height, width), px."""
     frames: tuple[_Frame, ...]
+    positions: NDArray[np.float64]
+    """[frames] times in intervals since the first frame, see `vestcl.data.sample.Clip.positions`."""
 
     @classmethod
     def open(cls, folder: Path | str) -> "PreparedClip":
@@ -95,12 +101,26 @@ class PreparedClip:
                 raise ValueError(f"{path}: must be {RECIPE!r}, got {about['recipe']!r}; {REMEDY}")
             frames = tuple(map(_frame, about["frames"]))
             height, width = map(int, about["size"])
-            return cls(Path(folder), about["name"], about["kind"], about["fps"], (height, width), frames)
+            interval, positions = _times(about["frames"])
+            return cls(Path(folder), about["name"], about["kind"], interval, (height, width), frames, positions)
         except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: is damaged ({error}); {REMEDY}") from error
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    @property
+    def fps(self) -> float | None:
+        """1 / `interval`; None if that is not known."""
+        return None if self.interval is None else round(1 / self.interval, 6)
+
+    def elapsed(self, index: int) -> float:
+        """Intervals from the frame before ``index`` to ``index``; 1 for the first frame."""
+        return float(self.positions[index] - self.positions[index - 1]) if index else 1.0
+
+    def is_whole(self, index: int, steps: int) -> bool:
+        """Whether frames t + 1 ... t + steps follow frame t = ``index`` without a gap: they are each other's next."""
+        return times.frames_after(self.positions, index, steps) == list(range(index + 1, index + steps + 1))
 
     @property
     def has_right(self) -> bool:
@@ -157,7 +177,8 @@ class PreparedClip:
         _fill(background_depth, ~mask, tensors["background_depth"])
         _fill(velocity, moving, tensors["velocity"])
         layers = Layers(image, depth, mask, background_image, background_depth)
-        return Prepared(known.name, known.K.copy(), layers, velocity, own, tensors.get("prev_from_cur"))
+        motion_back = tensors.get("prev_from_cur")
+        return Prepared(known.name, known.K.copy(), layers, velocity, own, motion_back, self.elapsed(index))
 
     def _frame(self, index: int) -> _Frame:
         if not 0 <= index < len(self):
@@ -190,6 +211,15 @@ def find_prepared(root: Path | str) -> list[PreparedClip]:
     if not folders:
         raise ValueError(f"{root}: has no prepared clip; `vestcl prepare` makes them")
     return [PreparedClip.open(folder) for folder in sorted(folders)]
+
+
+def _times(frames: list[dict[str, Any]]) -> tuple[float | None, NDArray[np.float64]]:
+    """The interval and the positions of clip.json's frames."""
+    seconds = [frame["timestamp"] for frame in frames]
+    interval = None if None in seconds else times.median_interval(seconds)
+    if interval is None:
+        return None, np.arange(len(frames), dtype=np.float64)
+    return interval, times.positions(seconds, interval)
 
 
 def _frame(about: dict[str, Any]) -> _Frame:

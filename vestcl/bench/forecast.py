@@ -157,20 +157,21 @@ def clips_of(text: str, config: ForecastBench) -> list[Clip]:
         raise ValueError(f"`inputs` must have streets from a lower to a higher seed, got {text}")
     for clip in clips:
         if not windows_of(clip, config):
-            wanted = f"{config.first + config.steps + 1} frames and a window from `first` to `last`"
+            wanted = f"{config.first + config.steps + 1} frames and a window from `first` to `last` without a gap"
             raise ValueError(f"{text}: must have {wanted}, got {len(clip)} frames, {config.first} and {config.last}")
     return clips
 
 
-def windows_of(clip: Clip, config: ForecastBench) -> range:
-    """The current frame t of every window: one frame stands before it and ``steps`` follow.
+def windows_of(clip: Clip, config: ForecastBench) -> list[int]:
+    """The current frame t of every window: one frame stands before it and ``steps`` follow, an interval apart.
 
     Args:
         clip: of any length.
         config: ``first``, ``last``, ``every`` and ``steps``.
     """
     end = len(clip) - 1 - config.steps
-    return range(config.first, (end if config.last is None else min(config.last, end)) + 1, config.every)
+    chosen = range(config.first, (end if config.last is None else min(config.last, end)) + 1, config.every)
+    return [index for index in chosen if clip.is_whole(index, config.steps)]
 
 
 def _run(groups: Sequence[_Group], config: ForecastBench, trunk: Trunk | None, console: Console) -> None:

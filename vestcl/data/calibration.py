@@ -6,6 +6,7 @@ the one place where the half is added. Matrices here are NumPy float64: position
 
 from typing import Final
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,9 @@ ROTATION_TOLERANCE: Final = 1e-4
 
 #: Metres; positions of drives are on one planet.
 FARTHEST: Final = 1e8
+
+#: Radians below which the series of a screw motion end after their first term, to 1e-9.
+_SMALL_TURN: Final = 1e-4
 
 
 def from_integer_centres(K: ArrayLike) -> Matrix:
@@ -82,6 +86,26 @@ def rigid(rotation: ArrayLike, xyz: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
 def invert(dst_from_src: Matrix) -> Matrix:
     """src_from_dst of a rigid [..., 4, 4]."""
     return geometry.invert(torch.from_numpy(dst_from_src)).numpy()
+
+
+def power(dst_from_src: Matrix, exponent: float) -> Matrix:
+    """exp(s log M): a rigid motion [4, 4] gone through for ``exponent`` s of its time at constant velocity, as a screw.
+
+    With the rotation vector w and t = V(w) v, V(w) = integral of R(u w) over u in [0, 1]: R(s w), s V(s w) v.
+    """
+    if exponent == int(exponent):  # exact for 1, and the same bits as repeated products
+        return np.asarray(np.linalg.matrix_power(dst_from_src, int(exponent)), np.float64)
+    turn: Matrix = np.asarray(cv2.Rodrigues(dst_from_src[:3, :3])[0], np.float64)[:, 0]
+    speed = np.linalg.solve(_mean_turn(turn), dst_from_src[:3, 3])
+    return rigid(cv2.Rodrigues(exponent * turn)[0], exponent * _mean_turn(exponent * turn) @ speed)
+
+
+def _mean_turn(turn: Matrix) -> Matrix:
+    """V(w) = I + (1 - cos a) / a^2 [w]x + (a - sin a) / a^3 [w]x^2 with a = |w|."""
+    a = float(np.linalg.norm(turn))
+    cross = np.cross(np.eye(3), turn)
+    first, second = (0.5, 1 / 6) if a < _SMALL_TURN else ((1 - np.cos(a)) / a**2, (a - np.sin(a)) / a**3)
+    return np.asarray(np.eye(3) + first * cross + second * cross @ cross, np.float64)
 
 
 def check_intrinsics(K: Matrix, where: str) -> None:

@@ -2,12 +2,13 @@
 
 import logging
 import re
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Final, TypeVar
 
 import numpy as np
 
+from vestcl import times
 from vestcl.data.calibration import Matrix, check_intrinsics, check_rigid, rigid, split_projection
 from vestcl.io.atomic import read_bytes
 
@@ -168,7 +169,16 @@ def numbered_next_to(
 
 
 def read_lines(path: Path) -> list[str]:
-    """The lines of a text file that are not empty.
+    """The lines of a text file that are not blank.
+
+    Raises:
+        ValueError: it can't be read, or is no text.
+    """
+    return list(numbered_lines(path).values())
+
+
+def numbered_lines(path: Path) -> dict[int, str]:
+    """The lines of a text file that are not blank, by their number in the file, from 1.
 
     Raises:
         ValueError: it can't be read, or is no text.
@@ -177,22 +187,27 @@ def read_lines(path: Path) -> list[str]:
         text = read_bytes(path, _LARGEST_TEXT).decode("utf-8")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is no text") from error
-    return [line for line in text.splitlines() if line.strip()]
+    return {number: line for number, line in enumerate(text.splitlines(), start=1) if line.strip()}
 
 
-def read_rows(path: Path, columns: Sequence[int], skip: int = 0) -> Matrix:
+def read_rows(path: Path, columns: Sequence[int], skip: int = 0, *, by_frame: bool = False) -> Matrix:
     """A text file's numbers as [rows, n].
 
     Args:
         path: the file.
         columns: the n that are allowed; all rows have the same.
         skip: lines of heading.
+        by_frame: each line belongs to the frame of its number, so that a blank line before the last one is refused: it
+            would shift what follows.
 
     Raises:
         ValueError: it can't be read, has no row, or one that is not n finite numbers; the message names the line.
     """
     rows: list[list[float]] = []
-    for number, line in enumerate(read_lines(path)[skip:], start=skip + 1):
+    lines = numbered_lines(path)
+    if by_frame:
+        _refuse_blank(path, lines)
+    for number, line in list(lines.items())[skip:]:
         try:
             row = [float(word) for word in line.split()]
         except ValueError as error:
@@ -212,12 +227,38 @@ def read_poses(path: Path) -> Matrix:
     Raises:
         ValueError: it can't be read, or a line is no rigid motion.
     """
-    rows = read_rows(path, (12, 16))
+    rows = read_rows(path, (12, 16), by_frame=True)
     poses = np.broadcast_to(np.eye(4), (len(rows), 4, 4)).copy()
     poses.reshape(-1, 16)[:, : rows.shape[1]] = rows
     for number, pose in enumerate(poses, start=1):
         check_rigid(pose, f"{path}: line {number}")
     return poses
+
+
+def read_times(path: Path, frames: Sequence[int] | None = None) -> Matrix:
+    """Seconds of times.txt, a line per frame.
+
+    Args:
+        path: the file.
+        frames: numbers of the frames that are looked at, from 0, increasing; None is all.
+
+    Returns:
+        [lines].
+
+    Raises:
+        ValueError: it can't be read, a line is blank or no finite number, or the frames' times do not increase; the
+            message names the line.
+    """
+    seconds = read_rows(path, (1,), by_frame=True)[:, 0]
+    known = [frame for frame in (range(len(seconds)) if frames is None else frames) if frame < len(seconds)]
+    times.check_increasing(seconds[known].tolist(), [f"line {frame + 1}" for frame in known], str(path))
+    return seconds
+
+
+def _refuse_blank(path: Path, lines: Mapping[int, str]) -> None:
+    blank = next((number for number in range(1, max(lines, default=0)) if number not in lines), None)
+    if blank is not None:
+        raise ValueError(f"{path}: line {blank} is blank; it must have what belongs to frame {blank - 1}")
 
 
 class Calibration:

@@ -6,7 +6,7 @@
     depth/*.png|exr|npy  z-depth; PNG needs "depth_scale"                                 (names as in image/)
     labels/*.png         classes; needs "label_ids"                                       (names as in image/)
     poses.txt            a line per frame, 3x4 or 4x4 world_from_cam
-    times.txt            a line per frame, seconds; without it "fps" gives the time
+    times.txt            a line per frame, seconds, increasing; without it "fps" gives the time
 
 Keys of camera.json: fx, fy, cx, cy in pixels (required); pixel_centre "integer" (0 is the centre of the first pixel, as
 in OpenCV and KITTI; the default) or "half" (0 is its edge); width, height of the images that these numbers are for:
@@ -71,7 +71,7 @@ def open_folder(path: str | Path, fov: float | None = None) -> Clip:
             frame.stem,
             undistorted_image(ImageFile(frame, *size), lens),
             camera.K,
-            timestamp=time if times is None else float(times[index, 0]),
+            timestamp=time if times is None else float(times[index]),
             world_from_cam=None if poses is None else poses[index],
             depth=undistorted_depth(depths.get(frame.stem), lens),
             labels=undistorted_labels(labels.get(frame.stem), lens),
@@ -110,10 +110,10 @@ def _lens(camera: Camera, size: tuple[int, int], path: Path) -> Lens | None:
 
 
 def _table(path: Path, frames: int) -> Matrix | None:
-    """The rows of times.txt or the matrices of poses.txt; None where there is no such file."""
+    """The seconds of times.txt or the matrices of poses.txt; None where there is no such file."""
     if not files.is_present(path):
         return None
-    rows = files.read_poses(path) if path.name == "poses.txt" else files.read_rows(path, (1,))
+    rows = files.read_poses(path) if path.name == "poses.txt" else files.read_times(path)
     if len(rows) != frames:
         raise ValueError(f"{path}: must have a line for each of {frames} frames, got {len(rows)}")
     return rows

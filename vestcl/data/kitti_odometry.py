@@ -36,7 +36,7 @@ def open_kitti_odometry(path: str | Path, sequence: str | None = None, rig: Rig 
     size = image_size(next(iter(frames.values())))
     K, left_from_cam0 = _camera(left, size, cameras)
     last = max(frames)
-    poses, times = _poses(folder, left_from_cam0, last), _times(folder, last)
+    poses, times = _poses(folder, left_from_cam0, last), _times(folder, list(frames))
     rights = _rights(folder, right, left_from_cam0, cameras, list(frames))
     samples = [
         Sample(
@@ -101,9 +101,9 @@ def _poses(folder: Path, left_from_cam0: Matrix, last: int) -> Matrix | None:
     return _long_enough(files.read_poses(path), path, last) @ calibration.invert(left_from_cam0)
 
 
-def _times(folder: Path, last: int) -> Matrix | None:
+def _times(folder: Path, frames: list[int]) -> Matrix | None:
     path = folder / "times.txt"
-    return _long_enough(files.read_rows(path, (1,))[:, 0], path, last) if files.is_present(path) else None
+    return _long_enough(files.read_times(path, frames), path, frames[-1]) if files.is_present(path) else None
 
 
 def _long_enough(rows: Matrix, path: Path, last: int) -> Matrix:

@@ -13,6 +13,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl import times
 from vestcl.data import calibration, files, fit
 from vestcl.data.calibration import Matrix
 from vestcl.data.files import Calibration
@@ -99,11 +100,11 @@ def open_kitti_raw(path: str | Path, rig: Rig = "colour", first_pose_identity: b
     size = image_size(next(iter(frames.values())))
     K, cam_from_rect0 = _camera(drive, left, size, cameras)
     poses = _poses(drive, list(frames), cam_from_rect0, cameras)
-    times = _times(drive / f"image_{left:02}" / "timestamps.txt", list(frames))
+    seconds = _times(drive / f"image_{left:02}" / "timestamps.txt", list(frames))
     depths = _depths(drive, left, K, cam_from_rect0, size, cameras, list(frames))
     rights = _rights(drive, right, cam_from_rect0, cameras, list(frames))
     samples = []
-    for (number, frame), time, pose in zip(frames.items(), times, poses, strict=True):
+    for (number, frame), time, pose in zip(frames.items(), seconds, poses, strict=True):
         image, depth, second = ImageFile(frame, *size), depths.get(number), rights.get(number)
         samples.append(Sample(frame.stem, image, K, timestamp=time, world_from_cam=pose, depth=depth, right=second))
     clip = Clip(drive.name, "KITTI raw", tuple(samples))
@@ -195,12 +196,25 @@ def _times(path: Path, frames: list[int]) -> list[float | None]:
     """Seconds since the first frame; None for all where there is no such file."""
     if not files.is_present(path):
         return [None] * len(frames)
-    lines = files.read_lines(path)
-    try:  # nanoseconds are more than datetime takes
-        moments = [datetime.fromisoformat(lines[frame].strip()[:26]) for frame in frames]
-    except (ValueError, IndexError) as error:
-        raise ValueError(f"{path}: must have a date and time for each of {frames[-1] + 1} frames ({error})") from error
-    return [(moment - moments[0]).total_seconds() for moment in moments]
+    moments = _moments(path, frames)
+    seconds = [(moment - moments[0]).total_seconds() for moment in moments]
+    times.check_increasing(seconds, [f"line {frame + 1}" for frame in frames], str(path))
+    return list(seconds)
+
+
+def _moments(path: Path, frames: list[int]) -> list[datetime]:
+    """A frame's line is the one of its number: a blank line shifts nothing."""
+    lines = files.numbered_lines(path)
+
+    def moment(line: int) -> datetime:
+        try:  # nanoseconds are more than datetime takes
+            return datetime.fromisoformat(lines.get(line, "").strip()[:26])
+        except ValueError as error:
+            got = repr(lines[line].strip()[:60]) if line in lines else "none"
+            wanted = f"must have a date and time for each of {frames[-1] + 1} frames"
+            raise ValueError(f"{path}: {wanted}, got {got} in line {line}") from error
+
+    return [moment(frame + 1) for frame in frames]
 
 
 def _depths(

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl import geometry
+from vestcl import geometry, times
 from vestcl.data import calibration, fit, resize
 from vestcl.data.sources import (
     DepthArray,
@@ -237,7 +237,11 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Clip(Sequence[Sample]):
-    """Consecutive frames of one camera at a steady rate."""
+    """Consecutive frames of one camera.
+
+    Motion is per second: `positions` has each frame's time in intervals of the clip, by which forecasts extrapolate. A
+    clip without timestamps is evenly spaced.
+    """
 
     name: str
     kind: str
@@ -264,11 +268,61 @@ class Clip(Sequence[Sample]):
 
     @functools.cached_property
     def fps(self) -> float | None:
-        """Frames a second by the first and the last timestamp; None if they are not known."""
-        first, last = self.samples[0].timestamp, self.samples[-1].timestamp
-        if first is None or last is None or last <= first:
+        """1 / `interval`; None if that is not known."""
+        return None if self.interval is None else round(1 / self.interval, 6)  # 25, not 24.999999999999996
+
+    @functools.cached_property
+    def interval(self) -> float | None:
+        """Seconds, the median from frame to frame (`vestcl.times.median_interval`); None without timestamps.
+
+        Raises:
+            ValueError: timestamps that do not increase; the message names the frames.
+        """
+        return None if self._seconds is None else times.median_interval(self._seconds)
+
+    @functools.cached_property
+    def positions(self) -> NDArray[np.float64]:
+        """[frames] times in intervals since the first frame; 0, 1, 2 ... where they are evenly spaced, or not known.
+
+        Raises:
+            ValueError: timestamps that do not increase; the message names the frames.
+        """
+        if self._seconds is None or self.interval is None:
+            return np.arange(len(self), dtype=np.float64)
+        return times.positions(self._seconds, self.interval)
+
+    def elapsed(self, index: int) -> float:
+        """Intervals from the frame before ``index`` to ``index``; 1 for the first frame.
+
+        Raises:
+            ValueError: timestamps that do not increase; the message names the frames.
+        """
+        return float(self.positions[index] - self.positions[index - 1]) if index else 1.0
+
+    def after(self, index: int, steps: int) -> list[int]:
+        """The frames at t + 1, t + 2, ... intervals, see `vestcl.times.frames_after`.
+
+        Args:
+            index: of the frame t.
+            steps: how many.
+        """
+        return times.frames_after(self.positions, index, steps)
+
+    def is_whole(self, index: int, steps: int) -> bool:
+        """Whether frames t + 1 ... t + steps follow frame t = ``index`` without a gap: they are each other's next."""
+        return self.after(index, steps) == list(range(index + 1, index + steps + 1))
+
+    @functools.cached_property
+    def _seconds(self) -> list[float] | None:
+        """Timestamps, increasing."""
+        known = [sample.timestamp for sample in self if sample.timestamp is not None]
+        if not known:
             return None
-        return round((len(self) - 1) / (last - first), 6)  # 25, not 24.999999999999996
+        if len(known) < len(self):
+            missing = next(sample.name for sample in self if sample.timestamp is None)
+            raise ValueError(f"{self.name}: frame {missing} must have a timestamp, as others do; got none")
+        times.check_increasing(known, [f"frame {sample.name}" for sample in self], self.name)
+        return known
 
     def resized(self, height: int, width: int) -> "Clip":
         """All samples at another size, see `Sample.resized`."""

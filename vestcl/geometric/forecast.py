@@ -1,4 +1,7 @@
-"""Future frames from new views at constant velocity: the camera's, and each thing's own."""
+"""Future frames from new views at constant velocity: the camera's, and each object's.
+
+Velocities are per interval of the clip (`Clip.interval`), whatever the time between the frames they are measured in.
+"""
 
 import time
 from collections.abc import Callable, Sequence
@@ -95,7 +98,17 @@ def forecast_frames(
             tell("render")
             frames[-1][view.name] = _render(moved, clip[index].K if view.K is None else view.K, view, clip)
     seconds = perception.seconds | {"render": time.perf_counter() - start}
-    return Forecast(METHOD, cameras[:steps], frames, seconds)
+    return Forecast(METHOD, cameras[:steps], frames, seconds, notes=gap_notes(perception, index))
+
+
+def gap_notes(perception: Perception, index: int) -> tuple[str, ...]:
+    """A line on the gap in time before frame ``index``, if it is too long for the frames to be matched."""
+    if not perception.is_lost(index):
+        return ()
+    clip = perception.clip
+    gap = clip.elapsed(index) * (clip.interval or 1.0)
+    names = f"{clip[index - 1].name} and {clip[index].name}"
+    return (f"frames {names} are {gap:.3g} s apart, too far to be matched: motion goes on as before the gap",)
 
 
 def show_frame(perception: Perception, index: int, views: Sequence[View]) -> dict[str, Rendered]:
@@ -118,10 +131,10 @@ def show_frame(perception: Perception, index: int, views: Sequence[View]) -> dic
 
 
 def _extrapolate(perception: Perception, index: int, steps: int) -> list[NDArray[np.float64]]:
-    """future_from_cur for each step."""
+    """future_from_cur for each step, which is an interval of the clip."""
     seen = range(max(index - _MOTIONS + 1, 1), index + 1)
     motions = [np.asarray(np.linalg.inv(perception.prev_from_cur(i)), np.float64) for i in seen]
-    motion = constant_velocity(motions)
+    motion = constant_velocity(motions, [perception.clip.elapsed(i) for i in seen])
     return [np.linalg.matrix_power(motion, step) for step in range(1, steps + 1)]
 
 
@@ -136,7 +149,8 @@ def _clouds(perception: Perception, index: int) -> list[MovingCloud]:
     cur_from_prev = np.asarray(np.linalg.inv(perception.prev_from_cur(index)), np.float64)
     everything = np.ones_like(cur.layers.mask)
     shown = _cloud(cur.layers.image, cur.layers.depth, everything, K, cur.velocity, cur.own)
-    before = _cloud(prev.layers.image, prev.layers.depth, ~prev.own, K, prev.velocity, None, cur_from_prev)
+    since = cur_from_prev, perception.clip.elapsed(index)
+    before = _cloud(prev.layers.image, prev.layers.depth, ~prev.own, K, prev.velocity, None, *since)
     hidden = ~cur.layers.mask & ~cur.own
     behind = _cloud(cur.layers.background_image, cur.layers.background_depth, hidden, K)
     return [shown, before, behind]
@@ -150,14 +164,18 @@ def _cloud(
     velocity: NDArray[np.float32] | None = None,
     own: NDArray[np.bool_] | None = None,
     cur_from_src: NDArray[np.float64] | None = None,
+    elapsed: float = 0.0,
 ) -> MovingCloud:
-    """The pixels of ``which`` [1, H, W] as points of the current camera; those of the recording car ride along."""
+    """The pixels of ``which`` [1, H, W] as points of the current camera; those of the recording car ride along.
+
+    ``elapsed`` intervals have gone by since the frame, whose camera ``cur_from_src`` brings to the current one.
+    """
     y, x = np.nonzero(which[0])
     z = depth[0, y, x].astype(np.float64)
     points = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(K).T * z[:, None]
     speed = np.zeros((1, 3)) if velocity is None else velocity[:, y, x].T.astype(np.float64)
-    if cur_from_src is not None:  # a frame interval ago
-        points = _transform(cur_from_src, points + speed)
+    if cur_from_src is not None:
+        points = _transform(cur_from_src, points + elapsed * speed)
         speed = speed @ cur_from_src[:3, :3].T
     z_src, colour = z.astype(np.float32), image[:, y, x].T
     rides = np.zeros((len(x), 1), bool) if own is None else own[0, y, x][:, None]

@@ -11,6 +11,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.data.calibration import power
 from vestcl.data.sample import Clip
 from vestcl.geometric import objects
 from vestcl.geometric.photometric import Pair, confirmed, search
@@ -34,6 +35,10 @@ _INVERSE_STD: Final = 0.002
 #: Depth maps with a smaller share of valid pixels are scans, to be densified.
 _DENSE: Final = 0.3
 
+#: From so many intervals on there is a gap between two frames. It is too long if flow is believed (its error forth and
+#: back, px) at less than that share of the pixels that it is believed at between the two frames before.
+_GAP, _BELIEVED, _LOST = 1.5, 1.0, 0.6
+
 #: Results of so many frames before the last one asked for are kept; a forecast looks at three.
 _KEPT: Final = 4
 
@@ -50,7 +55,7 @@ class Seen:
     things: NDArray[np.int32]
     """[H, W], 0 = background, else the thing."""
     velocity: NDArray[np.float32]
-    """[3, H, W] m a frame, in the camera's axes, of what each pixel shows; 0 where it stands still."""
+    """[3, H, W] m per interval of the clip, in the camera's axes, of what each pixel shows; 0 where it is static."""
     own: NDArray[np.bool_]
     """[1, H, W], True where the recording car itself is in the picture."""
 
@@ -63,7 +68,8 @@ class Perception:
 
     ``seconds`` tells the time by stage. Depth comes from the clip (scans are densified), else from its stereo pair,
     else from motion; masks from labels, else from motion. A depth map without a valid pixel is as a missing one, and
-    is logged.
+    is logged. Across a gap in time that is too long to match the frames on both sides of it, the camera moves on at the
+    velocity before, and depth from motion is that of a level road; see `is_lost`.
     """
 
     def __init__(self, clip: Clip, progress: Callable[[str], None] | None = None) -> None:
@@ -92,6 +98,13 @@ class Perception:
     def prev_from_cur(self, index: int) -> NDArray[np.float64]:
         """[4, 4] m: the camera's motion from frame ``index`` to the one before."""
         return self._once("ego-motion", index, lambda: self._ego_motion(index))
+
+    def is_lost(self, index: int) -> bool:
+        """Whether the frame before is too far away in time to be matched, and there is a motion before that."""
+        if index < 2 or self.clip.elapsed(index) < _GAP or self.is_lost(index - 1):
+            return False
+        now, before = ((self.correspondence(i).error < _BELIEVED).mean() for i in (index, index - 1))
+        return bool(now < _LOST * before)
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """M [1, H, W], True = static background."""
@@ -173,11 +186,17 @@ class Perception:
             raise ValueError(f"{self.clip.name}: needs two frames, a right camera or depth, got one frame alone")
         if index == 0:  # nothing is before it, so what comes after has to do
             return self._once("motion depth", 0, lambda: motion_depth([self.image(1), self.image(0)], self.clip[0].K))
-        images = [self.image(i) for i in range(max(index - 2, 0), index + 1)]
+        if self.is_lost(index):
+            alone = [self.image(index)] * 2
+            return self._once("motion depth", index, lambda: motion_depth(alone, self.clip[index].K))
+        first = index - 1 if self.is_lost(index - 1) else max(index - 2, 0)
+        images = [self.image(i) for i in range(first, index + 1)]
         known = self.correspondence(index)
         return self._once("motion depth", index, lambda: motion_depth(images, self.clip[index].K, correspondence=known))
 
     def _ego_motion(self, index: int) -> NDArray[np.float64]:
+        if self.is_lost(index):
+            return power(self.prev_from_cur(index - 1), self.clip.elapsed(index) / self.clip.elapsed(index - 1))
         if self._is_monocular(index):
             return self._from_motion(index).prev_from_cur
         sample = self.clip[index]
@@ -221,4 +240,5 @@ class Perception:
             velocity = by_thing.astype(np.float32)[things].transpose(2, 0, 1)
             by_flow = objects.follow_flow(velocity, layers.image, layers.depth, *motion)
             velocity = confirmed(by_flow, velocity, layers.depth, pair)
+            velocity /= np.float32(self.clip.elapsed(index))
         return Seen(layers, things, velocity, own)

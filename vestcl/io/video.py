@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from vestcl.io._video_decoder import Decoder
 from vestcl.io._video_packets import list_frames, orientation, oriented
+from vestcl.times import median_interval
 
 #: What a forked child inherits of open videos. Its state is the parent's at any moment, so that it is not even closed.
 _ABANDONED: Final[list[Decoder]] = []
@@ -50,7 +51,8 @@ class Video:
         self._list = listed.part(decoder.readable())
         self.frames, self.seconds = len(self._list.pts), self._list.seconds
         rate = decoder.stream.average_rate or 1
-        self.fps = float(rate) if self.frames == 1 else round(1 / float(np.median(np.diff(self.seconds))), 6)
+        interval = median_interval(self.seconds)
+        self.fps = float(rate) if interval is None else round(1 / interval, 6)
         self._open()
 
     def __len__(self) -> int:

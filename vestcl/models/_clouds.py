@@ -68,7 +68,7 @@ def as_image(points: torch.Tensor, height: int, width: int) -> torch.Tensor:
 
 
 def lift(
-    frame: EncodedFrame, points_xyz: torch.Tensor, flow: torch.Tensor, flow0: torch.Tensor, intervals: int
+    frame: EncodedFrame, points_xyz: torch.Tensor, flow: torch.Tensor, flow0: torch.Tensor, span: torch.Tensor | float
 ) -> Cloud:
     """What a frame shows: each pixel.
 
@@ -77,7 +77,7 @@ def lift(
         points_xyz: [B, H W, 3] m, of its pixels.
         flow: [B, 3, H, W] m, that pixels follow.
         flow0: the same without what objects do.
-        intervals: of frames that both span.
+        span: intervals of the clip that both take; a tensor is [B, 1, 1, 1].
 
     Returns:
         The cloud with H W points an image; differentiable.
@@ -92,7 +92,7 @@ def lift(
     return Cloud(
         points_xyz.flatten(0, 1),
         points(flow),
-        points((flow - flow0) / intervals),
+        points((flow - flow0) / span),
         layers.depth.flatten(),
         points(frame.features),
         points(layers.image),

@@ -126,15 +126,19 @@ def frame_planes(features: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor
 
 
 def joined(parts: Sequence[Nested]) -> Nested:
-    """One after the other along the first axis: tensors, or named tuples of such, however deep."""
+    """One after the other along the first axis: tensors, or named tuples of such, however deep; None stays."""
     first: Any = parts[0]
     if isinstance(first, torch.Tensor):
         return torch.cat(list(parts))  # type: ignore[arg-type, return-value]
+    if first is None:
+        return first  # type: ignore[return-value]
     return type(first)(*(joined(field) for field in zip(*parts, strict=True)))
 
 
 def mapped(function: Callable[[torch.Tensor], torch.Tensor], value: Nested) -> Nested:
-    """``function`` of a tensor, or of each in named tuples of such, however deep."""
+    """``function`` of a tensor, or of each in named tuples of such, however deep; None stays."""
+    if value is None:
+        return value
     if isinstance(value, torch.Tensor):
         return function(value)  # type: ignore[return-value]
     return type(value)(*(mapped(function, part) for part in value))  # type: ignore[attr-defined]

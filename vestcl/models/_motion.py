@@ -1,6 +1,6 @@
 """How everything moves to the next frame, and what follows from it: the answer of a forecast's step, the next prior."""
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -13,9 +13,6 @@ from vestcl.models.object_motion import ObjectMotionForecast
 from vestcl.models.prior import MotionPrior, repeated
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
-
-#: Frame intervals from t - 1 and from t to t + 1.
-INTERVALS: Final = (2, 1)
 
 
 class Motion(NamedTuple):
@@ -34,6 +31,8 @@ class Motion(NamedTuple):
     objects: ObjectMotionForecast
     """The flow that is used, each block's candidates, which ran, their probabilities; without object motion the flow
     is ``flow0`` and L = 0."""
+    spans: tuple[torch.Tensor | float, float] = (2.0, 1.0)
+    """Intervals that the previous frame's pixels and the current one's are on their way; a tensor is [B, 1, 1, 1]."""
 
     @property
     def rigid(self) -> torch.Tensor:
@@ -89,10 +88,13 @@ def arrived(prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, to_next: Mot
     points = unproject(prev.layers.depth, K), unproject(cur.layers.depth, K)
     of_prev = as_image(rigid_flow(points[0], *cur_from_prev), height, width)
     flow0 = torch.cat([of_prev, torch.zeros_like(of_prev)], dim=1)
+    elapsed: torch.Tensor | float = 1.0
     flow = flow0
     if isinstance(to_next, MotionPrior):
         turn = geometry.quaternion_to_matrix(cur_from_prev.quaternion)
-        beside = torch.einsum("bij,bjhw->bihw", turn, to_next.velocity_prev)
+        elapsed = to_next.span - 1
+        beside = elapsed * torch.einsum("bij,bjhw->bihw", turn, to_next.velocity_prev)
         flow = flow0 + torch.cat([beside, torch.zeros_like(beside)], dim=1)
     objects = ObjectMotionForecast(flow, [], torch.zeros(len(flow), 0, dtype=torch.bool), None)
-    return Motion(cur_from_prev, RigidMotion.rest(cur.features), (), points, flow0, flow, objects)
+    rest, spans = RigidMotion.rest(cur.features), (elapsed, 1.0)
+    return Motion(cur_from_prev, rest, (), points, flow0, flow, objects, spans)

@@ -8,11 +8,13 @@ import torch
 from torch.nn import functional
 
 from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
-from vestcl.models._motion import INTERVALS
 from vestcl.models.config import LOG_DEPTH_FAR
 from vestcl.models.ego_motion import CameraMotion
 from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
 from vestcl.models.skipping import Box, Skip, Tally, boxes
+
+#: From t - 1 and from t to t + 1; OMF runs at the interval that it learned at, of evenly spaced frames.
+_INTERVALS: Final = (2, 1)
 
 #: What is slower, metres an interval, stands: at 10 Hz half of a brisk walk ...
 SLOWEST: Final = 0.08
@@ -111,7 +113,7 @@ def _rolling(foreground: torch.Tensor, beside: torch.Tensor) -> torch.Tensor:
     """bool [B, 2, H, W]: where what is ``foreground`` [B, 2, H, W] moves by SLOWEST an interval or more beside the
     camera, ``beside`` [B, 6, H, W] m, in the mean over cells: some pixels of a parked car always seem to."""
     height, width = foreground.shape[2:]
-    metres = beside.unflatten(1, (2, 3)).square().sum(dim=2).sqrt() / beside.new_tensor(INTERVALS)[:, None, None]
+    metres = beside.unflatten(1, (2, 3)).square().sum(dim=2).sqrt() / beside.new_tensor(_INTERVALS)[:, None, None]
     share, moved = (
         functional.avg_pool2d(plane, _CELL, ceil_mode=True)
         for plane in (foreground.to(metres), torch.where(foreground, metres, 0))

@@ -12,7 +12,7 @@ from vestcl.models._encode import encode
 from vestcl.models._frames import EncodedFrame, grid_depth, grid_mean, with_depth
 from vestcl.models._layers import side_by_side
 from vestcl.models._memory import Memory, State
-from vestcl.models._motion import INTERVALS, Motion
+from vestcl.models._motion import Motion
 from vestcl.models._objects import move_objects, unmoved
 from vestcl.models._render import (
     Camera,
@@ -106,11 +106,16 @@ class Stages(nn.Module):
         flows = [rigid_flow(xyz, *rigid) for xyz, rigid in zip(points, to_next[:2], strict=True)]
         flow0 = as_image(torch.cat(flows, dim=2), *cur.features.shape[2:])
         start = flow0 if prior is None or self.object_motion is None else flow0 + beside(prior, to_next[:2])
-        return Motion(*to_next, points, flow0, start, self.move_objects(prev, cur, to_next, flow0, start))
+        spans = (2.0 if prior is None else prior.span, 1.0)
+        if prior is not None and not prior.is_corrected:
+            return Motion(*to_next, points, flow0, start, unmoved(start), spans)
+        return Motion(*to_next, points, flow0, start, self.move_objects(prev, cur, to_next, flow0, start), spans)
 
     @timed
     def move_camera(self, prev: EncodedFrame, cur: EncodedFrame, prior: MotionPrior | None = None) -> CameraMotion:
-        """EMF on the encoder's grid: the camera's motion; rest where the model has no EMF."""
+        """EMF on the encoder's grid: the camera's motion; rest where the model has no EMF, an uncorrected prior's."""
+        if prior is not None and not prior.is_corrected:
+            return CameraMotion(prior.next_from_cur.after(prior.cur_from_prev), prior.next_from_cur)
         if self.ego_motion is None or prev.camera_grid is None or cur.camera_grid is None:
             return CameraMotion(*2 * (RigidMotion.rest(cur.features),))
         mask_prev, mask_cur = (grid_mean(frame.layers.mask) for frame in (prev, cur))
@@ -149,7 +154,7 @@ class Stages(nn.Module):
         rigid, render = (motion.next_from_prev, motion.next_from_cur), self.config.render
         flows, flows0 = motion.objects.flow.split(3, dim=1), motion.flow0.split(3, dim=1)
         of_prev, of_cur = itertools.starmap(
-            lift, zip((prev, cur), motion.points, flows, flows0, INTERVALS, strict=True)
+            lift, zip((prev, cur), motion.points, flows, flows0, motion.spans, strict=True)
         )
         behind_cur = lift_hidden(cur, rigid[1], K)
         if render.inpainted != "own":

@@ -197,12 +197,16 @@ class ModelConfig:
     """Metres, for every pixel; None uses the depth that comes in."""
     start: Literal["rest", "prior"] = "rest"
     """What motion networks correct: no motion, or one that was measured and extrapolated (`MotionPrior`)."""
+    interval_s: float = 0.1
+    """Seconds from frame to frame that motion networks learned at; a prior over another interval is not corrected."""
 
     def __post_init__(self) -> None:
         if self.start not in ("rest", "prior"):
             raise ValueError(f'`start` must be "rest" or "prior", got {self.start!r}')
         if self.start == "rest" and self.ego_motion is not None and self.ego_motion.path > 1:
             raise ValueError(f'`ego_motion.path` must be 1 with `start` "rest", got {self.ego_motion.path}')
+        if not 0 < self.interval_s < float("inf"):
+            raise ValueError(f"`interval_s` must be positive seconds, got {self.interval_s}")
         if self.refine.base != "none" and not self.render.colour:
             raise ValueError("`refine.base` adds to the rendered colour, so it needs `render.colour`")
         if self.refine.base == "filled" and not self.render.normalised:

@@ -24,10 +24,25 @@ class MotionPrior(NamedTuple):
     prev_from_before: RigidMotion
     """... and from t - 2 to t - 1; where that is not known, ``cur_from_prev`` once more."""
     velocity_prev: torch.Tensor
-    """[B, 3, H, W] m a frame interval, in the camera's axes at t - 1: how what each pixel shows moves in the world; 0
-    where it stands still."""
+    """[B, 3, H, W] m per interval, in the camera's axes at t - 1: how what each pixel shows moves in the world; 0 where
+    it is static."""
     velocity_cur: torch.Tensor
     """The same at t."""
+    intervals: torch.Tensor | None = None
+    """[B] from t - 1 to t + 1; None is 2, of evenly spaced frames. From t to t + 1 it is 1."""
+    corrected: torch.Tensor | None = None
+    """[B] bool, whether the networks correct it; None is True. They know the interval that they learned at: where any
+    image has another one, motion is the prior's for all."""
+
+    @property
+    def span(self) -> torch.Tensor | float:
+        """``intervals`` to be multiplied with [B, C, H, W]."""
+        return 2.0 if self.intervals is None else self.intervals[:, None, None, None]
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether the networks correct the motion of all images."""
+        return self.corrected is None or bool(self.corrected.all())
 
 
 def nothing_moves(like: torch.Tensor) -> MotionPrior:
@@ -43,6 +58,9 @@ def check_prior(prior: MotionPrior, like: torch.Tensor) -> None:
         ValueError: a tensor of another shape.
     """
     batch, _, height, width = like.shape
+    for name, number in (("intervals", prior.intervals), ("corrected", prior.corrected)):
+        if number is not None and number.shape != (batch,):
+            raise ValueError(f"`prior.{name}` must be [{batch}], got {list(number.shape)}")
     check(
         **{
             f"prior.{name}.{part}": (getattr(getattr(prior, name), part), f"{batch} {size}")
@@ -57,9 +75,10 @@ def check_prior(prior: MotionPrior, like: torch.Tensor) -> None:
 
 
 def beside(prior: MotionPrior, to_next: Sequence[RigidMotion]) -> torch.Tensor:
-    """n R v [B, 6, H, W] m: what the velocities v add to the rigid flow over n = 2 and n = 1 intervals."""
+    """n R v [B, 6, H, W] m: what the velocities v add to the rigid flow over n = `MotionPrior.intervals` and n = 1."""
     moved = []
-    for velocity, rigid, intervals in zip((prior.velocity_prev, prior.velocity_cur), to_next, (2, 1), strict=True):
+    velocities, spans = (prior.velocity_prev, prior.velocity_cur), (prior.span, 1)
+    for velocity, rigid, intervals in zip(velocities, to_next, spans, strict=True):
         turn = geometry.quaternion_to_matrix(rigid.quaternion)
         moved.append(intervals * torch.einsum("bij,bjhw->bihw", turn, velocity))
     return torch.cat(moved, dim=1)
@@ -91,4 +110,5 @@ def repeated(
     velocity = as_image(points - before, height, width)
     known = (seen.depth > 0) & (seen.background < FOREGROUND_BELOW)
     velocity_prev = torch.einsum("bji,bjhw->bihw", rigid[:, :3, :3], moved.detach())
-    return MotionPrior(once, once, prior.cur_from_prev, velocity_prev, torch.where(known, velocity, 0))
+    velocity_cur = torch.where(known, velocity, 0)
+    return MotionPrior(once, once, prior.cur_from_prev, velocity_prev, velocity_cur, corrected=prior.corrected)

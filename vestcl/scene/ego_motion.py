@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vestcl.data.calibration import power
 from vestcl.scene import _check
 from vestcl.scene.correspondence import Correspondence, check_size
 
@@ -100,22 +101,30 @@ def _pairs(
     return (rays * z[..., None])[use], moved[use]
 
 
-def constant_velocity(motions: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+def constant_velocity(
+    motions: Sequence[NDArray[np.float64]], elapsed: Sequence[float] | None = None
+) -> NDArray[np.float64]:
     """``next_from_cur`` by the last motions: their mean translation, and their mean turn about the vertical axis.
 
-    A car pitches and rolls about a mean that it returns to, so the best forecast of either is to stay.
+    Each is brought to one interval first, as a screw motion. A car pitches and rolls about a mean that it returns to,
+    so the best forecast of either is to stay.
 
     Args:
         motions: [4, 4] each, ``cur_from_prev`` of consecutive frames, oldest first; at least one.
+        elapsed: intervals of the clip that each took, above 0; None is one each.
 
     Returns:
-        [4, 4] m.
+        [4, 4] m, over one interval.
 
     Raises:
-        ValueError: no motion.
+        ValueError: no motion, or another number of them than of ``elapsed``.
     """
     if not motions:
         raise ValueError("`motions` must have at least one motion")
+    if elapsed is not None:
+        if len(elapsed) != len(motions) or min(elapsed) <= 0:
+            raise ValueError(f"`elapsed` must be {len(motions)} numbers above 0, as `motions`, got {list(elapsed)}")
+        motions = [power(motion, 1 / taken) for motion, taken in zip(motions, elapsed, strict=True)]
     yaw = np.mean([cv2.Rodrigues(motion[:3, :3])[0][1, 0] for motion in motions])
     return rigid(np.array([0.0, yaw, 0.0]), np.mean([motion[:3, 3] for motion in motions], axis=0))
 

@@ -175,14 +175,15 @@ def predictions(truth: Truth, index: int, steps: int, views: Sequence[View], for
     """
     source = View(SOURCE, np.eye(4))
     current = truth.full(source, index)
-    flow = _flow(truth.full(source, index - 1), current, steps)
+    elapsed = truth.clip.elapsed(index)
+    flow = _flow(truth.full(source, index - 1), current, steps, elapsed)
     plain = {REPEAT: Prediction([current] * steps, 0.0), FLOW: flow}
     shown: Predictions = {}
     for view in views:
         is_source = view.name == SOURCE
         of_view = {name + ("" if is_source else OTHER_CAMERA): each for name, each in plain.items()}
         if not is_source:
-            of_view[ORACLE] = _flow(truth.full(view, index - 1), truth.full(view, index), steps)
+            of_view[ORACLE] = _flow(truth.full(view, index - 1), truth.full(view, index), steps, elapsed)
         for name, made in forecasts.items():
             pictures = [frame[view.name].image for frame in made.forecast.frames[:steps]]
             of_view[name] = Prediction(pictures, made.seconds)
@@ -272,8 +273,8 @@ def distance(
     return torch.stack([layer.mean(dim=(1, 2)) for layer in layers]).sum(dim=0)
 
 
-def _flow(previous: NDArray[np.float32], current: NDArray[np.float32], steps: int) -> Prediction:
+def _flow(previous: NDArray[np.float32], current: NDArray[np.float32], steps: int, elapsed: float) -> Prediction:
     start = time.perf_counter()
     before, now = (torch.from_numpy(np.ascontiguousarray(image))[None] for image in (previous, current))
-    pictures = list(baselines.flow_extrapolation(before, now, steps)[0].numpy())
+    pictures = list(baselines.flow_extrapolation(before, now, steps, elapsed=elapsed)[0].numpy())
     return Prediction(pictures, time.perf_counter() - start)
