@@ -143,7 +143,8 @@ def test_ten_frames_a_second_where_the_clip_does_not_tell(tmp_path: Path) -> Non
     clip = make_clip(fps=None)
     views = parse_views(["right"], clip)
     write_forecast(tmp_path, make_forecast(views), clip, 1, views, Details(""))
-    assert read_forecast(tmp_path).about["fps"] == 10
+    about = read_forecast(tmp_path).about
+    assert (about["fps"], about["interval_s"], about["notes"]) == (10, None, [])
     assert Video(tmp_path / "right" / "forecast.mp4").fps == 10
 
 

@@ -121,6 +121,7 @@ def test_a_run_learns_in_each_stage_what_that_may(models: None, whole: Path) -> 
     before = dict(states[2].named_parameters())
     moved = {name.split(".")[0] for name, value in states[4].named_parameters() if not torch.equal(value, before[name])}
     assert moved == {"encoder", "ego_motion", "refine"}
+    assert states[4].config.interval_s == 0.1  # the street's
     for step, still in ((4, True), (8, False)):
         objects = states[step].object_motion
         assert isinstance(objects, ObjectMotion)

@@ -204,7 +204,8 @@ def test_windows_with_a_gap_are_left_out(tmp_path: Path) -> None:
     prepare_clip(small, tmp_path)
     cache = PreparedClip.open(tmp_path)
     assert cache.interval == pytest.approx(0.1) and cache.positions == pytest.approx(small.positions)
-    assert WindowSet([cache], horizons=(0.5, 0.5)).windows == [(0, 8)]
+    windows = WindowSet([cache], horizons=(0.5, 0.5))
+    assert windows.windows == [(0, 8)] and windows.interval == 0.1
     assert cache.frame(AFTER_GAP).elapsed == 2.5
     wanted = prepare_frame(EightBitPerception(small), AFTER_GAP)
     np.testing.assert_allclose(cache.frame(AFTER_GAP).velocity, wanted.velocity, rtol=1e-3, atol=1e-6)

@@ -125,6 +125,12 @@ class WindowSet:
             found += [(number, t) for t in chosen if clip.is_whole(t - 1, 1 + len(self.horizons))]
         return found
 
+    @property
+    def interval(self) -> float | None:
+        """Seconds from frame to frame, the median over the clips whose times are known; None without any."""
+        known = [clip.interval for clip in self.clips if clip.interval is not None]
+        return round(float(np.median(known)), 6) if known else None
+
     def global_batch(self, seed: int, step: int, batch: int) -> list[Draw]:
         """The places of a step's batch, over all ranks.
 

@@ -4,6 +4,7 @@ From frames to the loss everything is differentiable, the OpenCL splatting inclu
 ``--resume`` goes on from its last checkpoint to the same weights. Under torchrun processes share each batch.
 """
 
+import dataclasses
 import signal
 import sys
 import time
@@ -158,6 +159,8 @@ class _Run:
         """The rest of a stage, of which ``done`` updates are made; whether it was finished."""
         stage = trainer.stage
         windows = window_set(self.config.data_of(stage))
+        learned = windows.interval or self.model.config.interval_s
+        self.model.config = dataclasses.replace(self.model.config, interval_s=learned)
         steps = range(done, stage.steps)
         batches = loader(
             windows, self.config.seed + number, stage.batch, steps, rank=self.ranks.rank, world=self.ranks.world,

@@ -6,7 +6,7 @@
 A frame's file holds, with n pixels where M = 0 and m pixels that move beside the camera:
 
     image, right [3, H, W] uint8, x = value / 255        background_image [3, n] uint8, background_depth [n] float32
-    depth [H, W] float32, m                              velocity [3, m] float16, m a frame interval
+    depth [H, W] float32, m                              velocity [3, m] float16, m per interval
     mask, own, moving [ceil(HW / 8)] uint8, a bit a pixel  prev_from_cur [4, 4] float64
 
 right and prev_from_cur are left out where there is none. Its metadata tell the key of what it was computed
