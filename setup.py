@@ -17,7 +17,7 @@ setup(
     package_dir={"vestcl.kernels": "kernels"},
     package_data={"vestcl": ["weights/*.safetensors"], "vestcl.kernels": ["*.cl", "*.h"]},
     install_requires=[
-        "av>=17",
+        "av>=18",
         "matplotlib>=3.8",
         "numpy>=1.26",
         "opencv-contrib-python-headless>=4.10",

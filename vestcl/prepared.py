@@ -101,7 +101,7 @@ class PreparedClip:
                 raise ValueError(f"{path}: must be {RECIPE!r}, got {about['recipe']!r}; {REMEDY}")
             frames = tuple(map(_frame, about["frames"]))
             height, width = map(int, about["size"])
-            interval, positions = _times(about["frames"])
+            interval, positions = _times(about["frames"], about["fps"])
             return cls(Path(folder), about["name"], about["kind"], interval, (height, width), frames, positions)
         except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: is damaged ({error}); {REMEDY}") from error
@@ -213,12 +213,12 @@ def find_prepared(root: Path | str) -> list[PreparedClip]:
     return [PreparedClip.open(folder) for folder in sorted(folders)]
 
 
-def _times(frames: list[dict[str, Any]]) -> tuple[float | None, NDArray[np.float64]]:
-    """The interval and the positions of clip.json's frames."""
-    seconds = [frame["timestamp"] for frame in frames]
-    interval = None if None in seconds else times.median_interval(seconds)
+def _times(frames: list[dict[str, Any]], fps: float | None) -> tuple[float | None, NDArray[np.float64]]:
+    """The interval and the positions of clip.json's frames; without times they are evenly spaced, by its rate."""
+    seconds = [frame["timestamp"] for frame in frames if frame.get("timestamp") is not None]
+    interval = times.median_interval(seconds) if len(seconds) == len(frames) else None
     if interval is None:
-        return None, np.arange(len(frames), dtype=np.float64)
+        return 1 / fps if fps else None, np.arange(len(frames), dtype=np.float64)
     return interval, times.positions(seconds, interval)
 
 
