@@ -146,6 +146,7 @@ def test_every_tensor_gets_a_gradient(name: str, cache: Path, tmp_path: Path) ->
         assert parameter.grad is not None and parameter.grad.isfinite().all(), parameter_name
         assert parameter.grad.abs().max() > 0, parameter_name
     assert update.view is not None and update.view.image.shape == (2, 3, 24, 64) and not update.skipped
+    assert not any(image.requires_grad for image in update.view), "it keeps the graph of the whole step in memory"
     assert set(update.terms) == {"loss", "l1", "ssim", "rotation", "translation", "residual_motion", "gradient"}
 
 

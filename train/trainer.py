@@ -34,7 +34,7 @@ class Update:
     seconds: dict[str, float]
     """Of this process: "splatting" is all that OpenCL did, forward and backward, "networks" the rest."""
     view: RenderedView | None
-    """None in stages that render nothing."""
+    """Without the graph of its computation. None in stages that render nothing."""
     skipped: bool
     """Whether the weights stayed as they were, because something was no number."""
 
@@ -137,7 +137,8 @@ class Trainer:
         self.schedule.step()
         session_seconds = session.seconds - splatting
         seconds = {"networks": time.perf_counter() - start - session_seconds, "splatting": session_seconds}
-        return Update(self.ranks.mean(told), seconds, view, broken)
+        shown = None if view is None else RenderedView(*(image.detach() for image in view))
+        return Update(self.ranks.mean(told), seconds, shown, broken)
 
     def state(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Of Adam and of the learning rate's schedule."""

@@ -3,6 +3,7 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from vestcl.host_memory import free_memory
 from vestcl.runtime import DeviceError, DeviceInfo, devices, use
 
 if TYPE_CHECKING:  # the others load on first use, for importing torch takes seconds
@@ -20,6 +21,7 @@ __all__ = [
     "composite",
     "devices",
     "displace",
+    "free_memory",
     "rasterize",
     "rigid_flow",
     "skipped",

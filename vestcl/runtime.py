@@ -6,17 +6,22 @@ makes the results visible::
     session = runtime.current()
     with session.job() as job:
         job.launch("unproject.cl", "unproject", {"REAL": "float"}, (count,), [np.int32(count), job.read(depth), ...])
+
+An exception may come up between any two bytecodes (KeyboardInterrupt does). What an interrupted job leaves behind, the
+next one clears away: it waits for kernels that still run, and only then lets go of their arrays.
 """
 
-import contextlib
+import atexit
 import contextvars
+import ctypes
 import functools
 import os
 import re
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import weakref
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -26,6 +31,7 @@ import pyopencl as cl
 import pyopencl.tools
 
 from vestcl import constants, pocl_cpu
+from vestcl.robust_lock import Holder, RobustLock, WithBlock
 
 Defines = Mapping[str, str | int]
 Buffer = cl.MemoryObjectHolder
@@ -90,11 +96,52 @@ class JobTimes:
     launches: tuple[Launch, ...]
 
 
+# ---------------------------------------------------------------- processes
+
+#: Whether OpenCL's drivers were loaded: their threads run from then on.
+_opencl_runs = False
+#: Whether this process was forked off one where they ran. Their threads are not in it: whoever waits for them, hangs.
+_forked = False
+
+
+def _refuse_after_fork() -> None:
+    if _forked:
+        raise DeviceError(
+            "OpenCL was used before this process was forked, and does not work after a fork: start processes with the "
+            "method 'spawn' or 'forkserver' (multiprocessing.get_context('spawn'), for a DataLoader "
+            "multiprocessing_context='spawn'), or use vestcl's devices only after the fork"
+        )
+
+
+def _after_fork() -> None:
+    """In the child: refuse what would hang, and never destroy OpenCL's objects, for that may hang, too."""
+    global _forked
+    if _opencl_runs:
+        _forked = True
+        for session in _sessions:
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
+
+
+def _before_exit() -> None:
+    """Wait for kernels of an interrupted job: their arrays are about to go."""
+    for session in () if _forked else tuple(_sessions):
+        if session._unfinished:
+            session._queue.finish()
+
+
+_sessions: "weakref.WeakSet[Session]" = weakref.WeakSet()
+atexit.register(_before_exit)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
 # ---------------------------------------------------------------- devices
 
 
 @functools.cache
 def _all_devices() -> tuple[tuple[DeviceInfo, cl.Device], ...]:
+    global _opencl_runs
+    _opencl_runs = True
     try:
         platforms = cl.get_platforms()
     except cl.LogicError as error:  # the loader's way to say that there are none
@@ -131,7 +178,12 @@ def _describe(index: str, platform: cl.Platform, device: cl.Device) -> DeviceInf
 
 
 def devices() -> list[DeviceInfo]:
-    """Every device of every OpenCL platform, in the loader's order."""
+    """Every device of every OpenCL platform, in the loader's order.
+
+    Raises:
+        DeviceError: in a process that was forked after OpenCL was used.
+    """
+    _refuse_after_fork()
     return [info for info, _ in _all_devices()]
 
 
@@ -144,7 +196,7 @@ def select(selector: str | None = None) -> DeviceInfo:
             it the first PoCL (pip installs one), else the first CPU, else the first device.
 
     Raises:
-        DeviceError: no device fits; the message lists those that there are.
+        DeviceError: no device fits, and the message lists those that there are; or as in `devices`.
     """
     selector = selector or os.environ.get("VESTCL_DEVICE")
     infos = devices()
@@ -163,10 +215,26 @@ def select(selector: str | None = None) -> DeviceInfo:
     return chosen[0]
 
 
-_selected: contextvars.ContextVar["Session | None"] = contextvars.ContextVar("vestcl_device", default=None)
+@dataclass(frozen=True, eq=False)
+class _Selection:
+    """What `use` chose. Where it was for a ``with`` block that runs no more, the one before it holds."""
+
+    session: "Session"
+    block: "use | None"
+    before: "_Selection | None"
 
 
-class use:  # noqa: N801 - reads as a verb, like contextlib.suppress
+_selected: contextvars.ContextVar[_Selection | None] = contextvars.ContextVar("vestcl_device", default=None)
+
+
+def _selection() -> _Selection | None:
+    selection = _selected.get()
+    while selection is not None and selection.block is not None and selection.block.abandoned:
+        selection = selection.before
+    return selection
+
+
+class use(WithBlock):  # noqa: N801 - reads as a verb, like contextlib.suppress
     """Run vestcl's operators on another device: from here on, or inside a ``with`` block.
 
     It holds for the thread that calls it; other threads start with the default device (set VESTCL_DEVICE for all).
@@ -186,22 +254,26 @@ class use:  # noqa: N801 - reads as a verb, like contextlib.suppress
         if mapping not in (None, "tile", "pixel"):
             raise ValueError(f"`mapping` must be 'tile', 'pixel' or None, got {mapping!r}")
         info = select(selector)
-        self._previous = _selected.set(open_session(info, mapping or ("tile" if info.kind == "CPU" else "pixel")))
+        self._session = open_session(info, mapping or ("tile" if info.kind == "CPU" else "pixel"))
+        self._before = _selection()
+        _selected.set(_Selection(self._session, None, None))
 
     def __enter__(self) -> "Session":
-        return current()
+        self._enter()
+        _selected.set(_Selection(self._session, self, self._before))
+        return self._session
 
-    def __exit__(self, *_: object) -> None:
-        _selected.reset(self._previous)
+    def _leave(self, *_: object) -> None:
+        _selected.set(self._before)
 
 
 def current() -> "Session":
     """The session that operators run on now; opens the default device on first use."""
-    session = _selected.get()
-    if session is None:
-        info = select()
-        session = open_session(info, "tile" if info.kind == "CPU" else "pixel")
-    return session
+    selection = _selection()
+    if selection is not None:
+        return selection.session
+    info = select()
+    return open_session(info, "tile" if info.kind == "CPU" else "pixel")
 
 
 @functools.cache
@@ -210,6 +282,12 @@ def open_session(info: DeviceInfo, mapping: str) -> "Session":
     if "PoCL" in info.version and shutil.which("ld") is None:
         raise DeviceError("PoCL calls the linker `ld`, which is not on PATH, and would abort: apt install binutils")
     return Session(info, mapping, device)
+
+
+def free_scratch() -> None:
+    """`Session.free_scratch` of every open device; a process that was forked has none."""
+    for session in () if _forked else tuple(_sessions):
+        session.free_scratch()
 
 
 # ---------------------------------------------------------------- programs
@@ -238,28 +316,39 @@ def source(name: str) -> str:
 
 # ---------------------------------------------------------------- sessions and jobs
 
-#: Who is told of jobs. One for the process: what is observed runs in threads that the observer does not know.
-_observer: Callable[[JobTimes], None] | None = None
 
-
-@contextlib.contextmanager
-def observe(observer: Callable[[JobTimes], None]) -> Iterator[None]:
+class observe(WithBlock):  # noqa: N801 - reads as a verb, as `use` does
     """Tell ``observer`` of every job, on any device and in any thread, that begins and ends inside the ``with`` block.
 
     Args:
-        observer: called when a job's results are there, in the job's thread, with its session locked.
+        observer: called when a job's results are there, in the job's thread, which still holds the session.
 
     Raises:
         ValueError: there is an observer already.
     """
-    global _observer
-    if _observer is not None:
-        raise ValueError("`observer` must be the only one, got a second")
-    _observer = observer
-    try:
-        yield
-    finally:
-        _observer = None
+
+    def __init__(self, observer: Callable[[JobTimes], None]) -> None:
+        self._observer = observer
+
+    def __enter__(self) -> None:
+        global _observation
+        self._enter()
+        if _current_observer() is not None:
+            raise ValueError("`observer` must be the only one, got a second")
+        _observation = self
+
+    def _leave(self, *_: object) -> None:
+        global _observation
+        _observation = None
+
+
+#: One for the process: what is observed runs in threads that the observer does not know.
+_observation: observe | None = None
+
+
+def _current_observer() -> Callable[[JobTimes], None] | None:
+    observation = _observation
+    return None if observation is None or observation.abandoned else observation._observer
 
 
 class Session:
@@ -279,10 +368,16 @@ class Session:
         self._plain_queue = self._queue = cl.CommandQueue(self._context)
         self._kernels: dict[tuple[str, tuple[tuple[str, str | int], ...]], dict[str, cl.Kernel]] = {}
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self._queue))
-        self._lock = threading.RLock()
+        self._lock = RobustLock()
         self._job: Job | None = None
-        self._profile: list[tuple[str, cl.Event]] | None = None
+        """The innermost one; it may be abandoned."""
+        self._unfinished = False
+        """From the begin of an outermost job until its kernels are done; left behind by a job that was interrupted."""
+        self._bound: list[tuple[cl.Buffer, np.ndarray]] = []
+        """What these kernels may use: it has to outlive them."""
+        self._profiles: list[_Profile] = []
         self._launched: list[tuple[str, int, cl.Event]] | None = None
+        _sessions.add(self)
 
     def __repr__(self) -> str:
         return f"Session({self.info.index} {self.info.platform} / {self.info.name}, mapping={self.mapping!r})"
@@ -297,11 +392,13 @@ class Session:
         return int(self._pool.managed_bytes)
 
     def free_scratch(self) -> None:
-        """Give scratch memory that nothing uses back to the system."""
-        self._pool.free_held()
+        """Give scratch memory that nothing uses back to the system, once the jobs that run now are done."""
+        with self.job():
+            self._pool.free_held()
 
     def kernel(self, file: str, name: str, defines: Defines) -> cl.Kernel:
         """Kernel ``name`` of ``file`` built with ``defines``; each program is built once and kept."""
+        _refuse_after_fork()
         key = (file, tuple(sorted(defines.items())))
         if key not in self._kernels:
             program = self._build(file, defines)
@@ -325,7 +422,7 @@ class Session:
         Every reading lies between two of the host's clock, whether the device has a call for it (OpenCL 2.1) or it
         takes an event's times.
         """
-        with self._lock:
+        with self.job():
             bounds = [self._clock_bounds() for _ in range(_CLOCK_READINGS)]
         return max(low for low, _ in bounds), min(high for _, high in bounds)
 
@@ -345,79 +442,127 @@ class Session:
     def _timing_queue(self) -> cl.CommandQueue:
         return cl.CommandQueue(self._context, properties=cl.command_queue_properties.PROFILING_ENABLE)
 
+    def profile(self) -> "_Profile":
+        """Collect start and end of every kernel that any thread launches inside the ``with`` block, in its order.
+
+        The block gets a list of `KernelTime`, which is filled when the block ends.
+        """
+        return _Profile(self)
+
+    def _enclosing(self) -> "Job | None":
+        """The innermost job that this thread is in."""
+        job = self._job
+        while job is not None and job.abandoned:
+            job = job._outer
+        return job if job is not None and job.thread == threading.get_ident() else None
+
     def _begin(self) -> None:
-        """Before an outermost job: both queues are empty, so that changing them changes no order."""
-        self._launched = None if _observer is None else []
-        times = self._profile is not None or _observer is not None
-        self._queue = self._timing_queue if times else self._plain_queue
+        """Before an outermost job: clear away what an interrupted one left."""
+        if self._unfinished:
+            self._queue.finish()
+            self._finished()
+        for profile in tuple(self._profiles):
+            if profile.abandoned:
+                self._profiles.remove(profile)
+        self._launched = None if _current_observer() is None else []
+        self._unfinished = True
 
-    @contextlib.contextmanager
-    def profile(self) -> Iterator[list[KernelTime]]:
-        """Collect every kernel's start and end inside the ``with`` block; the list is filled when it ends."""
-        times: list[KernelTime] = []
-        with self._lock:
-            events: list[tuple[str, cl.Event]] = []
-            before = self._queue
-            before.finish()
-            self._queue, self._profile = self._timing_queue, events
-            try:
-                yield times
-            finally:
-                self._queue.finish()
-                self._queue, self._profile = before, None
-                times.extend(KernelTime(name, e.profile.start, e.profile.end) for name, e in events)
+    def _finished(self) -> None:
+        """Nothing is enqueued any more."""
+        self._bound.clear()
+        self._unfinished = False
+
+    def _queue_for(self, timed: bool) -> cl.CommandQueue:
+        """The queue of the next launch; the other one is empty, so that changing them changes no order."""
+        wanted = self._timing_queue if timed else self._plain_queue
+        if wanted is not self._queue:
+            self._queue.finish()
+            self._queue = wanted
+        return wanted
 
 
-class Job:
+class _Profile(WithBlock):
+    """See `Session.profile`."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._times: list[KernelTime] = []
+        self.events: list[tuple[str, cl.Event]] = []
+
+    def __enter__(self) -> list[KernelTime]:
+        self._enter()
+        _refuse_after_fork()
+        self._session._profiles.append(self)
+        return self._times
+
+    def _leave(self, *_: object) -> None:
+        self._session._profiles.remove(self)
+        for name, event in () if _forked else self.events:
+            event.wait()
+            self._times.append(KernelTime(name, event.profile.start, event.profile.end))
+
+
+class Job(Holder):
     """Arrays and launches of one operator call. See the module's example. Inside another job, only that one waits."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
         self._outer: Job | None = None
-        self._bound: list[cl.Buffer] = []
         self._outputs: list[tuple[cl.Buffer, np.ndarray]] = []
 
     def __enter__(self) -> "Job":
-        self.session._lock.acquire()
-        self._outer, self.session._job = self.session._job, self
-        self._started = time.perf_counter_ns()
+        self._enter()
+        _refuse_after_fork()
+        session = self.session
+        self._outer = session._enclosing()
         if self._outer is None:
-            self.session._begin()
+            session._lock.acquire(self)
+            session._begin()
+        else:
+            self.thread = self._outer.thread
+        session._job = self
+        self._started = time.perf_counter_ns()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def _leave(self, kind: type[BaseException] | None, *_: object) -> None:
         self.session._job = self._outer
+        if self._outer is None:
+            self._end(kind is not None)
+        else:  # the outer job waits for all
+            self._outer._outputs += self._outputs
+
+    def _end(self, failed: bool) -> None:
+        session = self.session
         try:
-            if kind is not None:
-                self.session._queue.finish()
-            elif self._outer is None:
+            if not failed:
                 self.sync()
+            elif not _forked:
+                session._queue.finish()
+            session._finished()
+            if not failed:
                 self._tell()
-            else:  # the outer job waits for all
-                self._outer._bound += self._bound
-                self._outer._outputs += self._outputs
         finally:
-            if self._outer is None:
-                self.session.seconds += (time.perf_counter_ns() - self._started) / 1e9
-            self.session._lock.release()
+            session.seconds += (time.perf_counter_ns() - self._started) / 1e9
+            session._lock.release(self)
 
     def _tell(self) -> None:
         """The observer, of the launches that are done."""
         launched, self.session._launched = self.session._launched, None
-        if launched and _observer is not None:
+        observer = _current_observer()
+        if launched and observer is not None:
             end = time.perf_counter_ns()
             launches = (
                 Launch(name, enqueued, e.profile.queued, e.profile.submit, e.profile.start, e.profile.end)
                 for name, enqueued, e in launched
             )
-            _observer(JobTimes(self.session, self._started, end, tuple(launches)))
+            observer(JobTimes(self.session, self._started, end, tuple(launches)))
 
     def read(self, array: np.ndarray) -> Buffer:
         """``array`` as kernel input; on a CPU device the kernel reads the array itself."""
         assert array.flags.forc and array.size > 0
         where = cl.mem_flags.USE_HOST_PTR if self.session.shares_host_memory else cl.mem_flags.COPY_HOST_PTR
         buffer = cl.Buffer(self.session._context, cl.mem_flags.READ_ONLY | where, hostbuf=array)
-        self._bound.append(buffer)  # it owns the array, which has to outlive the kernels that read it
+        self.session._bound.append((buffer, array))
         return buffer
 
     def write(self, array: np.ndarray) -> Buffer:
@@ -428,6 +573,7 @@ class Job:
             buffer = cl.Buffer(self.session._context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=array)
         else:
             buffer = cl.Buffer(self.session._context, flags, size=array.nbytes)
+        self.session._bound.append((buffer, array))
         self._outputs.append((buffer, array))
         return buffer
 
@@ -445,19 +591,23 @@ class Job:
         local_size: Sequence[int] | None = None,
     ) -> None:
         """Enqueue kernel ``name``; scalars come as NumPy scalars of the exact C type."""
-        kernel = self.session.kernel(file, name, defines)
+        session = self.session
+        kernel = session.kernel(file, name, defines)
         values: Sequence[Any] = arguments  # pyopencl's type for them leaves out its own pooled buffers
         kernel.set_args(*values)
         local = tuple(local_size) if local_size else (1,) * len(global_size)
+        profiles = tuple(session._profiles)
+        queue = session._queue_for(timed=bool(profiles) or session._launched is not None)
         enqueued = time.perf_counter_ns()
-        event = cl.enqueue_nd_range_kernel(self.session._queue, kernel, tuple(global_size), local)
-        if self.session._profile is not None:
-            self.session._profile.append((name, event))
-        if self.session._launched is not None:
-            self.session._launched.append((name, enqueued, event))
+        event = cl.enqueue_nd_range_kernel(queue, kernel, tuple(global_size), local)
+        for profile in profiles:
+            profile.events.append((name, event))
+        if session._launched is not None:
+            session._launched.append((name, enqueued, event))
 
     def sync(self) -> None:
         """Wait for everything enqueued; afterwards the arrays given to `write` hold their results."""
+        _refuse_after_fork()
         queue = self.session._queue
         maps = []
         for buffer, array in self._outputs:
@@ -470,7 +620,6 @@ class Job:
         for mapped in maps:  # not before: rusticl aborts where a map has not come about yet
             mapped.base.release(queue)
         self._outputs.clear()
-        self._bound.clear()
 
 
 def defines_for(dtype: np.dtype, **more: str | int) -> dict[str, str | int]:

@@ -97,14 +97,41 @@ class _Recording:
         return min(max(ahead, least), most) if least <= most else ahead
 
 
+class _Record(runtime.observe):
+    """See `record`."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.recording = _Recording()
+        self._path = path
+        super().__init__(self.recording.job)
+
+    def __enter__(self) -> None:
+        global _record
+        if _current() is not None:
+            raise ValueError(f"`path` must be the only trace that is recorded, got {self._path} while another one is")
+        super().__enter__()
+        _record = self
+
+    def _leave(self, *_: object) -> None:
+        global _record
+        _record = None
+        super()._leave()
+        atomic.write_bytes(self._path, (json.dumps(_content(self.recording)) + "\n").encode())
+
+
 #: What records. One for the process, because stages of all threads belong to it.
-_recording: _Recording | None = None
+_record: _Record | None = None
 
 _NOTHING: Final = contextlib.nullcontext()
 
 
-@contextlib.contextmanager
-def record(path: str | Path | None) -> Iterator[None]:
+def _current() -> _Recording | None:
+    """Where stages belong now; not the recording of a ``with`` block that an interrupt ended."""
+    record = _record
+    return None if record is None or record.abandoned else record.recording
+
+
+def record(path: str | Path | None) -> AbstractContextManager[None]:
     """Record stages and kernels of all threads inside the ``with`` block, and write them when it ends, well or not.
 
     Args:
@@ -115,20 +142,7 @@ def record(path: str | Path | None) -> Iterator[None]:
 
     Source: Chrome's "Trace Event Format", as Perfetto reads it.
     """
-    global _recording
-    if path is None:
-        yield
-        return
-    if _recording is not None:
-        raise ValueError(f"`path` must be the only trace that is recorded, got {path} while another one is")
-    recording = _Recording()
-    with runtime.observe(recording.job):
-        _recording = recording
-        try:
-            yield
-        finally:
-            _recording = None
-            atomic.write_bytes(path, (json.dumps(_content(recording)) + "\n").encode())
+    return _NOTHING if path is None else _Record(path)
 
 
 def stage(name: str) -> AbstractContextManager[None]:
@@ -137,7 +151,8 @@ def stage(name: str) -> AbstractContextManager[None]:
     Args:
         name: as shown. A stage that goes on when the recording ends is not in it.
     """
-    return _NOTHING if _recording is None else _stage(name, _recording)
+    recording = _current()
+    return _NOTHING if recording is None else _stage(name, recording)
 
 
 @contextlib.contextmanager

@@ -78,9 +78,8 @@ class TileLists:
 
 def chunks_of(session: runtime.Session, points: int, counters: int) -> int:
     """Work-items that share ``points``, each with ``counters`` numbers of its own. No result depends on it."""
-    if session.mapping == "tile":
-        return CHUNKS_PER_UNIT * session.info.compute_units
-    return max(1, min(points // GPU_CHUNK, MAX_COUNTERS // counters))
+    wanted = CHUNKS_PER_UNIT * session.info.compute_units if session.mapping == "tile" else points // GPU_CHUNK
+    return max(1, min(wanted, MAX_COUNTERS // counters))
 
 
 def list_tiles(session: runtime.Session, geometry: Geometry) -> TileLists:
