@@ -2,6 +2,7 @@
 
 import contextvars
 import dataclasses
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -293,6 +294,60 @@ def test_a_profile_inside_a_job(kernels: Path, fresh: runtime.Session) -> None:
         again = scale(fresh, 3, array)
     assert [time.name for time in times] == ["scale"]
     assert result[0] == 2 and again[0] == 3
+
+
+def test_a_profile_holds_up_no_other_thread(kernels: Path, fresh: runtime.Session) -> None:
+    """Nor does it lose kernels: its own, or those of a profile around it."""
+    array = np.ones(100, np.float32)
+    with ThreadPoolExecutor(1) as other, fresh.profile() as outer:
+        scale(fresh, 2, array)
+        with fresh.profile() as inner:
+            assert other.submit(scale, fresh, 3, array).result(timeout=60)[0] == 3
+            assert other.submit(fresh.free_scratch).result(timeout=60) is None
+        scale(fresh, 4, array)
+    assert [len(times) for times in (outer, inner)] == [3, 1]
+    assert all(0 < one.start_ns <= one.end_ns for one in (*outer, *inner))
+
+
+def test_a_profile_and_an_observer_begin_while_a_job_runs(kernels: Path, fresh: runtime.Session) -> None:
+    """In another thread: the profile sees the job's remaining kernels, the observer none of its."""
+    array, heard = np.ones(100, np.float32), []
+    with ThreadPoolExecutor(1) as other:
+        begun, go_on = threading.Event(), threading.Event()
+
+        def work() -> list[np.ndarray]:
+            with fresh.job():
+                results = [scale(fresh, 2, array)]
+                begun.set()
+                assert go_on.wait(60)
+                results += [scale(fresh, 3, array), scale(fresh, 4, array)]
+            return results
+
+        running = other.submit(work)
+        assert begun.wait(60)
+        with runtime.observe(heard.append), fresh.profile() as times:
+            go_on.set()
+            results = running.result(timeout=60)
+    assert [result[0] for result in results] == [2, 3, 4]
+    assert len(times) == 2 and not heard
+
+
+def test_the_leftovers_of_a_failed_job_inside_another(kernels: Path, fresh: runtime.Session) -> None:
+    """The outer one goes on."""
+    array, result = np.ones(100, np.float32), np.empty(100, np.float32)
+
+    def fail() -> None:
+        with fresh.job() as inner:
+            arguments = [np.float32(2), inner.read(array), inner.write(result)]
+            inner.launch("scale.cl", "scale", runtime.defines_for(array.dtype), array.shape, arguments)
+            inner.launch("scale.cl", "no_such_kernel", runtime.defines_for(array.dtype), (1,), [])
+
+    with fresh.job() as outer:
+        with pytest.raises(KeyError):
+            fail()
+        others = scale(fresh, 3, array), scale(fresh, 4, array)
+        outer.sync()
+        assert [other[0] for other in others] == [3, 4] and result[0] == 2
 
 
 def test_a_session_counts_the_seconds_of_its_jobs(kernels: Path, fresh: runtime.Session) -> None:

@@ -1,5 +1,6 @@
 """vestcl.ops.splat gives the same bits: twice, on any number of threads, from any memory and in any layout."""
 
+import dataclasses
 import hashlib
 import os
 import subprocess
@@ -13,6 +14,7 @@ import torch
 from test_splat import INPUTS, all_of, assert_same_bits, detached, scene
 
 from vestcl import host_memory, runtime
+from vestcl.ops import _splat_lists
 from vestcl.ops.splat import composite, rasterize, splat
 
 
@@ -58,6 +60,20 @@ def test_any_number_of_threads(session: runtime.Session) -> None:
     with runtime.use(session.info.index, "tile"):
         assert [bits(5), bits(16)] == reports[0][1:3]
     assert reports[0][1:] == reports[1][1:]
+
+
+@pytest.mark.parametrize("most", [1 << 24, 100_000, 1])
+def test_counters_are_bounded_on_any_number_of_units(
+    mapped_session: runtime.Session, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    """Of a CPU with 100,000 units, too; and no result depends on how many chunks there are."""
+    counters = 3 * 6
+    usual = bits(5)
+    monkeypatch.setattr(mapped_session, "info", dataclasses.replace(mapped_session.info, compute_units=100_000))
+    monkeypatch.setattr(_splat_lists, "MAX_COUNTERS", most)
+    chunks = _splat_lists.chunks_of(mapped_session, 10**9, counters)
+    assert chunks >= 1 and (chunks == 1 or chunks * counters <= most)
+    assert bits(5) == usual
 
 
 @pytest.mark.parametrize("pattern", [0x00, 0xFF, 0x3F])  # zeros, NaN or -1, and harmless looking numbers

@@ -536,20 +536,21 @@ class Job(Holder):
         try:
             if not failed:
                 self.sync()
-            elif not _forked:
+            elif _forked:
+                return
+            else:
                 session._queue.finish()
             session._finished()
-            if not failed:
-                self._tell()
+            if session._launched and not failed:
+                self._tell(session._launched)
         finally:
             session.seconds += (time.perf_counter_ns() - self._started) / 1e9
             session._lock.release(self)
 
-    def _tell(self) -> None:
+    def _tell(self, launched: list[tuple[str, int, cl.Event]]) -> None:
         """The observer, of the launches that are done."""
-        launched, self.session._launched = self.session._launched, None
         observer = _current_observer()
-        if launched and observer is not None:
+        if observer is not None:
             end = time.perf_counter_ns()
             launches = (
                 Launch(name, enqueued, e.profile.queued, e.profile.submit, e.profile.start, e.profile.end)

@@ -43,7 +43,7 @@ OTHER_THREAD: Final = 10
 #: Seconds after which a call in another thread waits for a lock that nobody will release.
 PATIENCE: Final = 60.0
 #: Height, width, channels. The results of the large one are recycled memory.
-SIZES: Final = {"small": (24, 32, 4), "large": (64, 160, 16)}
+SIZES: Final = {"small": (24, 32, 4), "large": (48, 128, 16)}
 
 
 class Stopped(BaseException):
