@@ -36,7 +36,7 @@ def in_child(name, work):
 """
 
 DEVICES_ONLY = """
-in_child("before", lambda: None)
+in_child("before", vestcl.devices)
 vestcl.devices()
 in_child("devices", vestcl.devices)
 in_child("select", lambda: runtime.select("pocl"))

@@ -1,5 +1,7 @@
 """An exception between any two bytecodes leaves no lock held, no wrong result and no memory freed that kernels use."""
 
+import contextlib
+import contextvars
 import subprocess
 import sys
 import threading
@@ -15,8 +17,10 @@ from test_robust_lock import abandon
 
 import vestcl
 from vestcl import runtime
+from vestcl.ops import unproject
 
-PACKAGE = str(Path(vestcl.__file__).parent)
+#: Whose bytecodes count.
+PACKAGES = tuple(str(Path(sys.modules[name].__file__ or "").parent) for name in ("vestcl", "pyopencl"))
 
 
 class Stopped(BaseException):
@@ -24,7 +28,7 @@ class Stopped(BaseException):
 
 
 class Bytecodes:
-    """Counts the bytecodes of vestcl that run, and raises before the one that is asked for."""
+    """Counts the bytecodes of `PACKAGES` that run, and raises before the one that is asked for."""
 
     def __init__(self, stop: int = 0) -> None:
         self.stop, self.count = stop, 0
@@ -32,7 +36,7 @@ class Bytecodes:
     def __call__(self, frame: FrameType, event: str, _: Any) -> Any:
         if event == "call":
             frame.f_trace_opcodes, frame.f_trace_lines = True, False
-            return self if frame.f_code.co_filename.startswith(PACKAGE) else None
+            return self if frame.f_code.co_filename.startswith(PACKAGES) else None
         if event == "opcode":
             self.count += 1
             if self.count == self.stop:
@@ -145,6 +149,26 @@ def test_profiles_and_observers_stopped_at_every_bytecode(session: runtime.Sessi
     assert_survives(observed, check, 5)
 
 
+def test_building_a_kernel_stopped_at_many_bytecodes() -> None:
+    depth, inverse_K = np.ones((1, 1, 2, 2), np.float32), np.eye(3, dtype=np.float32)[None]
+    given = runtime.current()
+
+    def work() -> None:
+        session = runtime.Session(given.info, given.mapping, given._device)
+        for _ in range(2):
+            with contextlib.suppress(Stopped):  # once of the two times
+                assert unproject._forward(session, depth, inverse_K)[0, -1].tolist() == [1.5, 1.5, 1]
+        assert unproject._forward(session, depth, inverse_K)[0, -1].tolist() == [1.5, 1.5, 1]
+        assert len(session._kernels) == 1
+
+    whole = Bytecodes()
+    with traced(whole):
+        work()
+    for stop in range(1, whole.count // 3, 97):
+        with traced(Bytecodes(stop)), contextlib.suppress(Stopped):
+            work()
+
+
 def test_arrays_outlive_the_kernels_of_an_interrupted_job() -> None:
     """The end of the job is lost, and with it all that held the arrays; the next job waits before it lets them go."""
     session = runtime.current()
@@ -168,6 +192,27 @@ def test_use_ends_with_its_block_though_interrupted() -> None:
     with vestcl.use(mapping="pixel") as chosen:
         assert runtime.current() is chosen
     assert runtime.current() is before
+
+
+def test_use_without_a_block_goes_on() -> None:
+    """Whatever looks at it, and however often it is called; and blocks go back to it."""
+
+    def choose() -> None:
+        for _ in range(3):
+            kept = vestcl.use(mapping="pixel")
+        assert runtime.current().mapping == "pixel"
+        assert kept.__exit__ is not None and runtime.current().mapping == "pixel"
+        for _ in range(2):
+            with vestcl.use(mapping="tile"), contextlib.ExitStack() as stack:
+                stack.enter_context(vestcl.use(mapping="pixel"))
+                abandon(vestcl.use(mapping="tile"))
+                assert runtime.current().mapping == "pixel"
+                stack.close()
+                assert runtime.current().mapping == "tile"
+            assert runtime.current() is kept.session
+        assert kept._before is None, "a chain of all calls would be a leak"
+
+    contextvars.copy_context().run(choose)
 
 
 def test_an_interrupted_observer_hears_no_more() -> None:

@@ -6,6 +6,7 @@ helps. Like a robust mutex of POSIX, this lock therefore notices that its holder
 """
 
 import contextlib
+import functools
 import queue
 import threading
 import weakref
@@ -29,7 +30,7 @@ class _ExitOfBlock:
     def __get__(self, block: "WithBlock | None", kind: type["WithBlock"]) -> Exit:
         if block is None:  # contextlib.ExitStack takes it from the class
             return kind._leave  # type: ignore[return-value] # and passes the block
-        leave = block._leave  # a new object each time
+        leave = functools.partial(block._leave)  # not the bound method: Python may unpack and drop it as it calls it
         if block._exit is None or block._exit() is None:
             block._exit = weakref.ref(leave)
         return leave

@@ -215,23 +215,7 @@ def select(selector: str | None = None) -> DeviceInfo:
     return chosen[0]
 
 
-@dataclass(frozen=True, eq=False)
-class _Selection:
-    """What `use` chose. Where it was for a ``with`` block that runs no more, the one before it holds."""
-
-    session: "Session"
-    block: "use | None"
-    before: "_Selection | None"
-
-
-_selected: contextvars.ContextVar[_Selection | None] = contextvars.ContextVar("vestcl_device", default=None)
-
-
-def _selection() -> _Selection | None:
-    selection = _selected.get()
-    while selection is not None and selection.block is not None and selection.block.abandoned:
-        selection = selection.before
-    return selection
+_selected: contextvars.ContextVar["use | None"] = contextvars.ContextVar("vestcl_device", default=None)
 
 
 class use(WithBlock):  # noqa: N801 - reads as a verb, like contextlib.suppress
@@ -254,24 +238,42 @@ class use(WithBlock):  # noqa: N801 - reads as a verb, like contextlib.suppress
         if mapping not in (None, "tile", "pixel"):
             raise ValueError(f"`mapping` must be 'tile', 'pixel' or None, got {mapping!r}")
         info = select(selector)
-        self._session = open_session(info, mapping or ("tile" if info.kind == "CPU" else "pixel"))
-        self._before = _selection()
-        _selected.set(_Selection(self._session, None, None))
+        self.session = open_session(info, mapping or ("tile" if info.kind == "CPU" else "pixel"))
+        self._permanent = False
+        self._before = _use()
+        if self._before is not None and self._before._permanent:
+            self._before._before = None  # which a ``with`` block would go back to
+        _selected.set(self)
 
     def __enter__(self) -> "Session":
         self._enter()
-        _selected.set(_Selection(self._session, self, self._before))
-        return self._session
+        self._permanent = False
+        _selected.set(self)
+        return self.session
 
     def _leave(self, *_: object) -> None:
         _selected.set(self._before)
 
+    def _holds(self) -> bool:
+        """Not where it is for a ``with`` block that an interrupt ended."""
+        if self._exit is None:  # no ``with`` statement enters it
+            self._permanent = True
+        return self._permanent or not self.abandoned
+
+
+def _use() -> use | None:
+    """The last one that holds here."""
+    chosen = _selected.get()
+    while chosen is not None and not chosen._holds():
+        chosen = chosen._before
+    return chosen
+
 
 def current() -> "Session":
     """The session that operators run on now; opens the default device on first use."""
-    selection = _selection()
-    if selection is not None:
-        return selection.session
+    chosen = _use()
+    if chosen is not None:
+        return chosen.session
     info = select()
     return open_session(info, "tile" if info.kind == "CPU" else "pixel")
 
@@ -443,9 +445,9 @@ class Session:
         return cl.CommandQueue(self._context, properties=cl.command_queue_properties.PROFILING_ENABLE)
 
     def profile(self) -> "_Profile":
-        """Collect start and end of every kernel that any thread launches inside the ``with`` block, in its order.
+        """Collect start and end of every kernel that any thread launches here inside the ``with`` block.
 
-        The block gets a list of `KernelTime`, which is filled when the block ends.
+        The block gets a list of `KernelTime` in the order of the launches; it is filled when the block ends.
         """
         return _Profile(self)
 
