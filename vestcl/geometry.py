@@ -17,9 +17,12 @@ def quaternion_to_matrix(quaternion: torch.Tensor) -> torch.Tensor:
         quaternion: [..., 4], (w, x, y, z), of any length.
 
     Returns:
-        Rotation [..., 3, 3]; differentiable everywhere, zero quaternion included (that one gives I).
+        Rotation [..., 3, 3]; differentiable everywhere, any number of times, zero quaternion included (it gives I).
     """
-    norm = torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True).clamp(min=constants.QUATERNION_FLOOR)
+    floor = constants.QUATERNION_FLOOR
+    tiny = torch.linalg.vector_norm(quaternion.detach(), dim=-1, keepdim=True) < floor
+    # Not clamp: the second derivative of |q| at 0 is NaN, and so would be its product with clamp's 0.
+    norm = torch.where(tiny, floor, torch.linalg.vector_norm(torch.where(tiny, 1, quaternion), dim=-1, keepdim=True))
     w, x, y, z = (quaternion / norm).unbind(-1)
     entries = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

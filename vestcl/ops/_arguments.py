@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from torch.autograd import forward_ad
 
 from vestcl import runtime
 
@@ -39,7 +40,7 @@ def check(**arguments: tuple[Any, str]) -> dict[str, int]:
 
     Raises:
         ValueError: a value is no dense float32 or float64 torch CPU tensor or NumPy array, is of another kind or
-            dtype than the first one, or does not fit its shape.
+            dtype than the first one, does not fit its shape, or is differentiated as in `require_ordinary`.
     """
     first = next(iter(arguments))
     sizes: dict[str, int] = {}
@@ -62,6 +63,7 @@ def _check_value(name: str, value: Any) -> None:
         raise ValueError(f"`{name}` must be a dense tensor, got layout {value.layout}")
     if _dtype(value) not in ("float32", "float64"):
         raise ValueError(f"`{name}` must be float32 or float64, got {_dtype(value)}")
+    require_ordinary(name, value)
 
 
 def _check_alike(name: str, value: Any, first: str, leader: Any) -> None:
@@ -121,6 +123,36 @@ def check_starts(
     if array[0] != 0 or array[-1] != total or (np.diff(array) < 0).any():
         raise ValueError(f"`{name}` must rise from 0 to {total}, got {array.tolist() if len(array) <= 16 else array}")
     return array
+
+
+def require_ordinary(name: str, value: torch.Tensor | np.ndarray | None) -> None:
+    """Refuse a tensor of a transform or a tracer, which kernels would not notice or could not read.
+
+    Raises:
+        ValueError: a transform of torch.func is active, ``value`` holds no numbers, or it carries a tangent of
+            forward-mode derivatives.
+    """
+    if not isinstance(value, torch.Tensor):
+        return
+    if torch._C._are_functorch_transforms_active() or torch._C._is_tracing() or not _holds_numbers(value):
+        raise ValueError(
+            f"`{name}` must be used outside torch.func's transforms, vectorised Jacobians and tracing: pass a batch "
+            f"instead of using vmap, use torch.autograd.grad instead of torch.func.grad, or take the operator of "
+            f"vestcl.reference (plain torch)"
+        )
+    if forward_ad.unpack_dual(value).tangent is not None:
+        raise ValueError(
+            f"`{name}` must carry no forward-mode tangent (operators have reverse-mode gradients): use "
+            f"torch.autograd.grad, or take the operator of vestcl.reference (plain torch)"
+        )
+
+
+def _holds_numbers(value: torch.Tensor) -> bool:
+    """Whether there is memory on the CPU behind a tensor: wrappers of batches or of other tensors have none."""
+    try:
+        return value.untyped_storage().device.type == "cpu"
+    except (NotImplementedError, RuntimeError):
+        return False
 
 
 def require_no_grad(name: str, value: torch.Tensor | np.ndarray | None) -> None:

@@ -1,15 +1,17 @@
 """Forward 3D displacement and projection into a camera (kernels/displace.cl)."""
 
+import functools
 from typing import Any
 
 import numpy as np
 import torch
-from torch.autograd.function import once_differentiable
 
 from vestcl import runtime
-from vestcl.ops._arguments import Array, as_array, check, require_no_grad, work_items
+from vestcl.ops._arguments import Array, as_array, check, require_no_grad, require_ordinary, work_items
+from vestcl.ops._autograd import differentiable_by, untraced
 
 
+@untraced
 def displace(
     points_xyz: Array, displacement_xyz: Array, K: Array, tgt_from_src: Array | None = None
 ) -> tuple[Array, Array]:
@@ -26,7 +28,8 @@ def displace(
 
     Returns:
         points_uv [B, N, 2] px and z [B, N] m in the target camera, of the kind and dtype that came in; both
-        differentiable in ``points_xyz`` and ``displacement_xyz``.
+        differentiable in ``points_xyz`` and ``displacement_xyz``, any number of times (from the second on in plain
+        torch).
 
     Raises:
         ValueError: an argument of another kind, dtype or shape, or a camera that requires grad.
@@ -59,15 +62,28 @@ class _Displace(torch.autograd.Function):
         return torch.from_numpy(points_uv), torch.from_numpy(z)
 
     @staticmethod
-    @once_differentiable
-    def backward(
-        ctx: Any, grad_points_uv: torch.Tensor, grad_z: torch.Tensor
-    ) -> tuple[torch.Tensor | None, torch.Tensor | None, None]:
+    @untraced
+    def backward(ctx: Any, grad_points_uv: torch.Tensor, grad_z: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        require_ordinary("grad_points_uv", grad_points_uv)
+        require_ordinary("grad_z", grad_z)
         points_needed, displacement_needed, _ = ctx.needs_input_grad
-        points_xyz, displacement_xyz = (as_array(saved) for saved in ctx.saved_tensors)
-        gradients = as_array(grad_points_uv), as_array(grad_z)
-        grad_xyz = torch.from_numpy(_backward(ctx.session, points_xyz, displacement_xyz, ctx.projection, *gradients))
-        return grad_xyz if points_needed else None, grad_xyz if displacement_needed else None, None
+        inputs, grad_outputs = ctx.saved_tensors, (grad_points_uv, grad_z)
+        points_xyz, displacement_xyz, *arrays = map(as_array, (*inputs, *grad_outputs))
+        grad_xyz = torch.from_numpy(_backward(ctx.session, points_xyz, displacement_xyz, ctx.projection, *arrays))
+        grads = (grad_xyz if points_needed else None, grad_xyz if displacement_needed else None)
+        formula = functools.partial(_formula, torch.from_numpy(ctx.projection))
+        return *differentiable_by(formula, inputs, grad_outputs, grads), None
+
+
+def _formula(
+    projection: torch.Tensor, points_xyz: torch.Tensor, displacement_xyz: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The kernel's formula in plain torch, for the derivatives of its gradients."""
+    moved_xyz = points_xyz + displacement_xyz
+    a, b, c, z = (moved_xyz @ projection[..., :3].mT + projection[:, None, :, 3]).unbind(-1)
+    finite = (a / c).isfinite() & (b / c).isfinite()
+    safe = torch.where(finite, c, 1)
+    return torch.stack([torch.where(finite, x / safe, torch.nan) for x in (a, b)], dim=-1), z
 
 
 def _projection(K: np.ndarray, tgt_from_src: np.ndarray | None) -> np.ndarray:

@@ -4,16 +4,17 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from torch.autograd.function import once_differentiable
 
-from vestcl import constants, runtime
-from vestcl.ops._arguments import Array, as_array, check, work_items
+from vestcl import constants, geometry, runtime
+from vestcl.ops._arguments import Array, as_array, check, require_ordinary, work_items
+from vestcl.ops._autograd import Gradients, differentiable_by, untraced
 
 #: Partial sums per image in the gradient of the motion, the same on every device and so the same order of additions.
 #: Each is a work-item; one work-item adds the 256 up, so more of them would make that last step the longer one.
 CHUNKS: Final = 256
 
 
+@untraced
 def rigid_flow(points_xyz: Array, quaternion: Array, translation: Array) -> Array:
     """u = R x + t - x with R = R(q / max(|q|, 1e-8)).
 
@@ -25,7 +26,8 @@ def rigid_flow(points_xyz: Array, quaternion: Array, translation: Array) -> Arra
         translation: [B, 3] m, translation of ``dst_from_src``. Of the same kind and dtype.
 
     Returns:
-        displacement_xyz [B, N, 3] m, of the kind and dtype that came in; differentiable in all three.
+        displacement_xyz [B, N, 3] m, of the kind and dtype that came in; differentiable in all three, any number
+        of times (from the second on in plain torch).
 
     Raises:
         ValueError: an argument of another kind, dtype or shape.
@@ -50,21 +52,22 @@ class _RigidFlow(torch.autograd.Function):
         return torch.from_numpy(_forward(ctx.session, *arrays))
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_displacement_xyz: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        points_needed, quaternion_needed, translation_needed = ctx.needs_input_grad
-        points_xyz, quaternion = (as_array(saved) for saved in ctx.saved_tensors)
-        arrays = points_xyz, quaternion, as_array(grad_displacement_xyz)
-        grad_points_xyz = grad_quaternion = grad_translation = None
-        if points_needed:
-            grad_points_xyz = torch.from_numpy(_backward_points(ctx.session, *arrays))
-        if quaternion_needed or translation_needed:
-            grad_quaternion, grad_translation = map(torch.from_numpy, _backward_motion(ctx.session, *arrays))
-        return (
-            grad_points_xyz,
-            grad_quaternion if quaternion_needed else None,
-            grad_translation if translation_needed else None,
-        )
+    @untraced
+    def backward(ctx: Any, grad_displacement_xyz: torch.Tensor) -> Gradients:
+        require_ordinary("grad_displacement_xyz", grad_displacement_xyz)
+        points_xyz, quaternion = ctx.saved_tensors
+        arrays = as_array(points_xyz), as_array(quaternion), as_array(grad_displacement_xyz)
+        grads = _backward(ctx.session, *arrays, ctx.needs_input_grad)
+        translation = quaternion.new_zeros(len(quaternion), 3)  # no gradient depends on it
+        return differentiable_by(_formula, (points_xyz, quaternion, translation), (grad_displacement_xyz,), grads)
+
+
+def _formula(points_xyz: torch.Tensor, quaternion: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
+    """The kernel's formula in plain torch, for the derivatives of its gradients."""
+    finite = points_xyz.isfinite().all(dim=-1, keepdim=True)
+    safe = torch.where(finite, points_xyz, 0)
+    moved_xyz = geometry.transform_points(geometry.compose_rigid(quaternion, translation), safe)
+    return torch.where(finite, moved_xyz - safe, torch.nan)
 
 
 def _defines(dtype: np.dtype) -> dict[str, str | int]:
@@ -84,6 +87,27 @@ def _forward(
             defines = _defines(points_xyz.dtype)
             job.launch("rigid_flow.cl", "rigid_flow", defines, (items, batch), arguments, (group, 1))
     return displacement_xyz
+
+
+def _backward(
+    session: runtime.Session,
+    points_xyz: np.ndarray,
+    quaternion: np.ndarray,
+    grad_displacement_xyz: np.ndarray,
+    needed: tuple[bool, bool, bool],
+) -> Gradients:
+    arrays = points_xyz, quaternion, grad_displacement_xyz
+    points_needed, quaternion_needed, translation_needed = needed
+    grad_points_xyz = grad_quaternion = grad_translation = None
+    if points_needed:
+        grad_points_xyz = torch.from_numpy(_backward_points(session, *arrays))
+    if quaternion_needed or translation_needed:
+        grad_quaternion, grad_translation = map(torch.from_numpy, _backward_motion(session, *arrays))
+    return (
+        grad_points_xyz,
+        grad_quaternion if quaternion_needed else None,
+        grad_translation if translation_needed else None,
+    )
 
 
 def _backward_points(

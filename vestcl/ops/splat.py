@@ -1,14 +1,14 @@
 """Depth-sorted alpha splatting: rasterise a geometry once, composite any number of feature sets on it."""
 
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Any, Generic, NoReturn
 
 import numpy as np
 import torch
-from torch.autograd.function import once_differentiable
 
 from vestcl import constants, runtime
-from vestcl.ops._arguments import Array, as_array, check, check_starts, require_no_grad
+from vestcl.ops._arguments import Array, as_array, check, check_starts, require_no_grad, require_ordinary
+from vestcl.ops._autograd import Gradients, differentiable_once, untraced
 from vestcl.ops._splat_composite import Layer, Wanted, composite_backward, composite_forward
 from vestcl.ops._splat_lists import Geometry, TileLists, list_tiles
 from vestcl.ops._splat_skipped import Skipped, count_culled
@@ -27,6 +27,18 @@ class Raster(Generic[Array]):
     """Whether clouds are packed one after another (``cloud_starts`` was given)."""
     geometry: Geometry
     lists: TileLists
+    grad_fns: tuple[Any, ...]
+    """The arrays' nodes in autograd's graph when `rasterize` was called."""
+
+    def __copy__(self) -> "Raster[Array]":
+        return self  # it is never changed
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        """What copy.deepcopy and pickle ask for."""
+        raise TypeError(
+            "a Raster can't be deep-copied or pickled, for its lists live on an OpenCL device: keep points_uv, z, "
+            "radii and opacities, and call vestcl.rasterize again"
+        )
 
     @property
     def height(self) -> int:
@@ -37,6 +49,7 @@ class Raster(Generic[Array]):
         return self.geometry.width
 
 
+@untraced
 def splat(
     points_uv: Array,
     z: Array,
@@ -82,7 +95,8 @@ def splat(
 
     Returns:
         image [B, C, H, W] in channels-last memory (what a torch convolution on a CPU likes best) and coverage
-        [B, 1, H, W], of the kind and dtype that came in; differentiable in all but z.
+        [B, 1, H, W], of the kind and dtype that came in; differentiable in all but z, once: a second derivative
+        raises NotImplementedError. Both may be changed in place.
 
     Raises:
         ValueError: an argument of another kind, dtype, shape or device, or a ``z`` that requires grad (pass
@@ -96,6 +110,7 @@ def splat(
         return composite(raster, features, backgrounds, min_transmittance)
 
 
+@untraced
 def rasterize(
     points_uv: Array,
     z: Array,
@@ -113,7 +128,8 @@ def rasterize(
 
     Returns:
         A `Raster`. It holds device memory (about 24 bytes for each point and tile that it touches, in float32) and a
-        copy of the numbers: changing the arguments in place afterwards does not change it.
+        copy of the numbers: changing the arguments in place afterwards does not change it. Where autograd recorded
+        that change, `composite` raises ValueError, for the argument's graph is that of the new numbers.
     """
     require_no_grad("z", z)
     letters = "B N" if cloud_starts is None else "P"
@@ -140,9 +156,11 @@ def rasterize(
         list_transparent=_requires_grad(opacities),
     )
     lists = list_tiles(runtime.current(), geometry)
-    return Raster(points_uv, radii, opacities, cloud_starts is not None, geometry, lists)
+    grad_fns = tuple(_grad_fn(array) for array in (points_uv, radii, opacities))
+    return Raster(points_uv, radii, opacities, cloud_starts is not None, geometry, lists, grad_fns)
 
 
+@untraced
 def composite(
     raster: Raster[Array], features: Array, backgrounds: Array | None = None, min_transmittance: float = 0.0
 ) -> tuple[Array, Array]:
@@ -160,14 +178,17 @@ def composite(
         raise ValueError(f"`min_transmittance` must be in [0, 1), got {min_transmittance}")
     if _requires_grad(raster.opacities) and not raster.geometry.list_transparent:
         raise ValueError("`raster.opacities` must require grad when `rasterize` is called, got them requiring it since")
+    _check_graph(raster)
     if not isinstance(features, torch.Tensor):
         image, coverage, _ = composite_forward(_layer(raster, features, backgrounds, min_transmittance))
         return image.transpose(0, 3, 1, 2), coverage[:, None]
-    return _Composite.apply(
+    image, coverage, _ = _Composite.apply(
         raster, min_transmittance, raster.points_uv, raster.radii, raster.opacities, features, backgrounds
     )
+    return image, coverage
 
 
+@untraced
 def skipped(raster: Raster[Array], min_transmittance: float = 0.0) -> Skipped:
     """Count what compositing on ``raster`` skips: points that no list holds, tiles without points, opaque pixels.
 
@@ -204,6 +225,8 @@ def skipped(raster: Raster[Array], min_transmittance: float = 0.0) -> Skipped:
 
 
 class _Composite(torch.autograd.Function):
+    """Image and coverage, and an empty tensor by which gradients lead back to all inputs (`differentiable_once`)."""
+
     @staticmethod
     def forward(
         ctx: Any,
@@ -214,32 +237,37 @@ class _Composite(torch.autograd.Function):
         opacities: torch.Tensor,
         features: torch.Tensor,
         backgrounds: torch.Tensor | None,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         image, coverage, ctx.learnt = composite_forward(_layer(raster, features, backgrounds, min_transmittance))
         ctx.raster, ctx.min_transmittance = raster, min_transmittance
         ctx.shapes = {"points_uv": points_uv.shape, "radii": radii.shape, "opacities": opacities.shape}
-        ctx.save_for_backward(features, backgrounds)
+        origin = features.new_empty(0)
+        ctx.save_for_backward(features, backgrounds, origin)
         ctx.set_materialize_grads(False)
-        return torch.from_numpy(image).permute(0, 3, 1, 2), torch.from_numpy(coverage)[:, None]
+        # Arrays are reshaped before they are tensors: torch lets no view of several outputs be changed in place.
+        return torch.from_numpy(image.transpose(0, 3, 1, 2)), torch.from_numpy(coverage[:, None]), origin
 
     @staticmethod
-    @once_differentiable
+    @untraced
     def backward(
-        ctx: Any, grad_image: torch.Tensor | None, grad_coverage: torch.Tensor | None
-    ) -> tuple[torch.Tensor | None, ...]:
-        features, backgrounds = ctx.saved_tensors
+        ctx: Any, grad_image: torch.Tensor | None, grad_coverage: torch.Tensor | None, _: torch.Tensor | None
+    ) -> Gradients:
+        require_ordinary("grad_image", grad_image)
+        require_ordinary("grad_coverage", grad_coverage)
+        features, backgrounds, origin = ctx.saved_tensors
         layer = _layer(ctx.raster, features, backgrounds, ctx.min_transmittance)
         size = (layer.geometry.batch, layer.channels, layer.geometry.height, layer.geometry.width)
-        if grad_image is None:
-            grad_image = features.new_zeros(size)
+        image = np.zeros(size, layer.dtype) if grad_image is None else grad_image.detach().resolve_neg().numpy()
+        cover = None if grad_coverage is None else as_array(grad_coverage)
         names = ("points_uv", "radii", "opacities", "features", "backgrounds")
         wanted = Wanted(**dict(zip(names, ctx.needs_input_grad[2:], strict=True)))
-        cover = None if grad_coverage is None else as_array(grad_coverage)
-        grads = composite_backward(layer, ctx.learnt, grad_image.resolve_neg().numpy(), cover, wanted)
+        arrays = composite_backward(layer, ctx.learnt, image, cover, wanted)
         shapes = {**ctx.shapes, "features": features.shape}
-        tensors = (torch.from_numpy(grads[name]) if name in grads else None for name in names)
-        shaped = (t if t is None else t.reshape(shapes.get(n, t.shape)) for n, t in zip(names, tensors, strict=True))
-        return None, None, *shaped
+        shaped = (
+            arrays[name].reshape(shapes.get(name, (-1, layer.channels))) if name in arrays else None for name in names
+        )
+        grads = tuple(array if array is None else torch.from_numpy(array) for array in shaped)
+        return None, None, *differentiable_once("splat", (grad_image, grad_coverage, origin), grads)
 
 
 def _layer(raster: Raster[Any], features: Array, backgrounds: Array | None, min_transmittance: float) -> Layer:
@@ -250,6 +278,17 @@ def _layer(raster: Raster[Any], features: Array, backgrounds: Array | None, min_
 
 def _requires_grad(array: Array) -> bool:
     return isinstance(array, torch.Tensor) and array.requires_grad
+
+
+def _check_graph(raster: Raster[Any]) -> None:
+    """Refuse a geometry that would send its gradients to where other numbers came from."""
+    for name, grad_fn in zip(("points_uv", "radii", "opacities"), raster.grad_fns, strict=True):
+        if torch.is_grad_enabled() and _grad_fn(getattr(raster, name)) is not grad_fn:
+            raise ValueError(f"`raster.{name}` must be what `rasterize` got, got it changed in place: rasterise again")
+
+
+def _grad_fn(array: Array) -> Any:
+    return array.grad_fn if isinstance(array, torch.Tensor) else None
 
 
 def _size(name: str, value: int) -> int:

@@ -5,8 +5,10 @@ import torch
 
 from vestcl import constants, runtime
 from vestcl.ops._arguments import Array, as_array, check, work_items
+from vestcl.ops._autograd import untraced
 
 
+@untraced
 def stretch(points_uv: Array, magnified: Array) -> tuple[Array, Array]:
     """How much farther apart than magnified a picture's points come to lie, and which are torn from all neighbours.
 

@@ -4,12 +4,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.autograd.function import once_differentiable
 
 from vestcl import runtime
-from vestcl.ops._arguments import Array, as_array, check, require_no_grad, work_items
+from vestcl.ops._arguments import Array, as_array, check, require_no_grad, require_ordinary, work_items
+from vestcl.ops._autograd import untraced
 
 
+@untraced
 def unproject(depth: Array, K: Array) -> Array:
     """p = z K^-1 (u, v, 1) at pixel centres (u, v) = (column + 0.5, row + 0.5).
 
@@ -19,7 +20,7 @@ def unproject(depth: Array, K: Array) -> Array:
 
     Returns:
         points_xyz [B, H W, 3] m in the camera's frame, row after row, of the kind and dtype that came in;
-        differentiable in ``depth``.
+        differentiable in ``depth``, any number of times.
 
     Raises:
         ValueError: an argument of another kind, dtype or shape, a singular ``K``, or one that requires grad.
@@ -31,19 +32,37 @@ def unproject(depth: Array, K: Array) -> Array:
     if not isinstance(depth, torch.Tensor):
         return _forward(runtime.current(), as_array(depth), _inverse(as_array(K)))
     require_no_grad("K", K)
-    return _Unproject.apply(depth, _inverse(as_array(K)))
+    return _Unproject.apply(depth, runtime.current(), _inverse(as_array(K)))
 
 
 class _Unproject(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, depth: torch.Tensor, inverse_K: np.ndarray) -> torch.Tensor:
-        ctx.session, ctx.shape, ctx.inverse_K = runtime.current(), depth.shape, inverse_K
-        return torch.from_numpy(_forward(ctx.session, as_array(depth), inverse_K))
+    def forward(ctx: Any, depth: torch.Tensor, session: runtime.Session, inverse_K: np.ndarray) -> torch.Tensor:
+        ctx.session, ctx.shape, ctx.inverse_K = session, depth.shape, inverse_K
+        return torch.from_numpy(_forward(session, as_array(depth), inverse_K))
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_points_xyz: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return torch.from_numpy(_backward(ctx.session, ctx.shape, ctx.inverse_K, as_array(grad_points_xyz))), None
+    @untraced
+    def backward(ctx: Any, grad_points_xyz: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        require_ordinary("grad_points_xyz", grad_points_xyz)
+        return _UnprojectBackward.apply(grad_points_xyz, ctx.session, ctx.shape, ctx.inverse_K), None, None
+
+
+class _UnprojectBackward(torch.autograd.Function):
+    """Linear in the gradient of the points, as `unproject` is in the depth: each is the other's backward."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, grad_points_xyz: torch.Tensor, session: runtime.Session, shape: torch.Size, inverse_K: np.ndarray
+    ) -> torch.Tensor:
+        ctx.session, ctx.inverse_K = session, inverse_K
+        return torch.from_numpy(_backward(session, shape, inverse_K, as_array(grad_points_xyz)))
+
+    @staticmethod
+    @untraced
+    def backward(ctx: Any, grad_grad_depth: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
+        require_ordinary("grad_grad_depth", grad_grad_depth)
+        return _Unproject.apply(grad_grad_depth, ctx.session, ctx.inverse_K), None, None, None
 
 
 def _inverse(K: np.ndarray) -> np.ndarray:
@@ -68,7 +87,7 @@ def _forward(session: runtime.Session, depth: np.ndarray, inverse_K: np.ndarray)
 
 
 def _backward(
-    session: runtime.Session, shape: tuple[int, int, int, int], inverse_K: np.ndarray, grad_points_xyz: np.ndarray
+    session: runtime.Session, shape: torch.Size, inverse_K: np.ndarray, grad_points_xyz: np.ndarray
 ) -> np.ndarray:
     batch, _, height, width = shape
     grad_depth = np.empty(shape, grad_points_xyz.dtype)
