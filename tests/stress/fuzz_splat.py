@@ -68,7 +68,9 @@ class Tally:
     fragments: int = 0
     ambiguous_pixels: int = 0
     worst: float = 0.0
-    """The largest error as a part of its bound."""
+    """The largest error as a part of its bound ..."""
+    worst_at: str = ""
+    """... and where it is."""
     bounds: list[float] = field(default_factory=list)
     """Of each float32 scene's image: its median bound as a part of its largest value."""
     failures: list[str] = field(default_factory=list)
@@ -378,13 +380,12 @@ def compare(what: str, got: Array, wanted: Bounded, program: Program, tally: Tal
     part[~np.isfinite(got)] = np.inf
     assert not np.isnan(wanted.error).any(), f"{what}: no bound"
     worst = np.unravel_index(np.argmax(part), part.shape)
-    tally.worst = max(tally.worst, float(part[worst]))
+    where = f"{what}{[int(i) for i in worst]}"
+    if part[worst] > tally.worst:
+        tally.worst, tally.worst_at = float(part[worst]), where
     if not part[worst] <= 1:
-        at, place = float(got[worst]), [int(i) for i in worst]
-        text = (
-            f"{what}{place} is {at:.9g}, not {float(wanted.value[worst]):.9g} within {float(wanted.error[worst]):.1e}"
-        )
-        tally.failures.append(f"{text} ({program})")
+        values = f"{got[worst]:.9g}, not {wanted.value[worst]:.9g} within {wanted.error[worst]:.1e}"
+        tally.failures.append(f"{where} is {values} ({program})")
 
 
 def run(share: float, seed: int, only: int | None = None) -> Tally:
@@ -408,8 +409,9 @@ def main() -> int:
     median = np.median(tally.bounds) if tally.bounds else 0.0
     print(
         f"fuzz_splat: {tally.scenes} scenes, {tally.fragments} fragments, {len(tally.failures)} failures in "
-        f"{time.monotonic() - started:.0f} s; the largest error is {tally.worst:.2f} of its bound, which for "
-        f"float32 images is {median:.1e} in the median; {tally.ambiguous_pixels} ambiguous pixels left out"
+        f"{time.monotonic() - started:.0f} s; the largest error is {tally.worst:.2g} of its bound "
+        f"({tally.worst_at}), which for float32 images is {median:.1e} in the median; "
+        f"{tally.ambiguous_pixels} ambiguous pixels left out"
     )
     for failure in tally.failures[:SHOWN_FAILURES]:
         print(f"  {failure}")
