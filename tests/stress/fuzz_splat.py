@@ -3,11 +3,11 @@
     python tests/stress/fuzz_splat.py [--share 1.0] [--seed 0] [--scene 123]
 
 The reference composites densely, every point at every pixel, and carries a bound along of what the operator's
-roundings may change: each operation of its formula adds its own rounding (unit: the dtype's eps, twice what rounding to
-nearest makes) to what its operands bring. Two places have no such bound. At a footprint's rim (d2 = r2 within
-the bound) a fragment may be there or not: its alpha is 0 within the bound either way, its gradient counts as error in
-full. Where T is min_transmittance within the bound, what lies behind may show or not: that pixel is left out of the
-comparison, and of the loss.
+roundings may change: each operation of its formula adds its own rounding to what its operands bring. The unit is the
+dtype's eps: half of it for the operator, which rounds to nearest, and half for the reference in float64. Two places
+have no such bound. At a footprint's rim (d2 = r2 within the bound) a fragment may be there or not: its alpha is 0
+within the bound either way, its gradient counts as error in full. Where T is min_transmittance within the bound, what
+lies behind may show or not: that pixel is left out of the comparison, and of the loss.
 """
 
 import argparse
@@ -233,7 +233,9 @@ class Cloud:
         terms = np.abs(self.weight).T @ np.abs(self.f)
         error = self.weight_error.T @ np.abs(self.f) + last_error[:, None] * np.abs(background)
         error += self.eps * ((self.near.sum(axis=0)[:, None] + 2) * terms + 2 * np.abs(behind))
-        return Bounded(self.weight.T @ self.f + behind, error), Bounded(1 - last, last_error + self.eps)
+        return Bounded(self.weight.T @ self.f + behind, error), Bounded(
+            1 - last, last_error + self.eps * np.abs(1 - last)
+        )
 
     def gradients(self, background: Array, g: Array, h: Array) -> dict[str, Bounded]:
         """Of sum(g image) + sum(h coverage), with g [P, C] and h [P]."""
