@@ -177,6 +177,44 @@ def test_a_damaged_clip(tmp_path: Path, content: str, message: str) -> None:
         PreparedClip.open(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"fps": null', '"fps": 1000'),
+        ("4.1", "4.2"),
+        ('"checksum"', '"checksun"'),
+        ('"name": "noise"', '"name": "nose"'),
+    ],
+)
+def test_a_changed_clip(noise: tuple[Path, Prepared], old: str, new: str) -> None:
+    """JSON that is whole, with another content than was written."""
+    path = noise[0] / "clip.json"
+    text = path.read_text()
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=r"clip.json: is damaged \((the|no) checksum\); run `vestcl prepare` again$"):
+        PreparedClip.open(noise[0])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"F32","shape":[7,9]', '"I32","shape":[7,9]', r"depth must be float32 \[7, 9\], got int32 \[7, 9\]"),
+        ('"F32","shape":[7,9]', '"F32","shape":[9,7]', r"depth must be float32 \[7, 9\], got float32 \[9, 7\]"),
+        ('"mask":{', '"musk":{', "mask"),
+        ('\\"checksums\\"', '\\"checksumz\\"', "no entry 'checksums'"),
+        ('"vestcl"', '"vastcl"', "no entry 'vestcl'"),
+    ],
+)
+def test_a_changed_header(noise: tuple[Path, Prepared], old: str, new: str, message: str) -> None:
+    path = frame_path(noise[0], 0)
+    content = path.read_bytes()
+    assert content.count(old.encode()) == 1
+    path.write_bytes(content.replace(old.encode(), new.encode()))
+    with pytest.raises(ValueError, match=rf"^[^\n]*000000.safetensors: is damaged \([^\n]*{message}[^\n]*\); run"):
+        PreparedClip.open(noise[0]).frame(0)
+
+
 def test_no_clip(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"clip.json: No such file"):
         PreparedClip.open(tmp_path)
@@ -192,6 +230,7 @@ def test_no_such_frame(folder: Path, index: int) -> None:
 
 def test_finding(noise: tuple[Path, Prepared], tmp_path: Path) -> None:
     about = json.loads((tmp_path / "clip.json").read_text())
+    del about["checksum"]  # as files of vestcl 0.3, which can be read
     (tmp_path / "clip.json").unlink()
     for place in ("set/.vestcl/b", "set/.vestcl/a", "set/c/deep", "other"):
         (tmp_path / place).mkdir(parents=True)

@@ -5,6 +5,7 @@ import dataclasses
 import fcntl
 import functools
 import hashlib
+import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -21,7 +22,7 @@ from vestcl.io.atomic import read_bytes
 from vestcl.io.images import to_float, to_pixels
 from vestcl.io.video import Video
 from vestcl.prepared import prepare_frame
-from vestcl.prepared_files import JSON, RECIPE, frame_path, read_tensors, write_clip, write_frame
+from vestcl.prepared_files import JSON, RECIPE, Shape, frame_path, restore_frame, write_clip, write_frame
 
 #: Frames before it that perception looks at: depth from motion sees three, and the frame before has to have it, too.
 LOOKS_BACK: Final = 3
@@ -68,7 +69,8 @@ def prepare_clip(
     """Compute what is missing of a clip's cache; afterwards it is complete.
 
     Files are replaced whole, so that it may be killed at any moment and goes on from there. Frames whose key is the
-    same and whose checksums are right are kept. Processes that prepare one clip at once do so one after the other.
+    same and which are whole are kept; whatever else has a frame's or clip.json's name, a folder, too, is replaced.
+    Processes that prepare one clip at once do so one after the other.
 
     Args:
         clip: at the size wanted, two frames or more.
@@ -93,10 +95,13 @@ def prepare_clip(
 def _complete(clip: Clip, folder: Path, estimators: str, report: Report) -> Outcome:
     start = time.perf_counter()
     keys = frame_keys(clip, estimators)
-    missing = {index for index, key in enumerate(keys) if not _is_there(folder, index, key)}
+    missing = {index for index, key in enumerate(keys) if not _is_there(clip, folder, index, key)}
     seconds = Counter({"check": time.perf_counter() - start})
-    if missing:
-        (folder / JSON).unlink(missing_ok=True)  # a clip of old and new frames is no clip
+    if missing or not (folder / JSON).is_file():
+        _remove(folder / JSON)  # a clip of old and new frames is no clip
+    for path in (frame_path(folder, index) for index in missing):
+        if not path.is_file():  # a file is replaced in one step, a folder can't be
+            _remove(path)
     _tidy(folder, len(clip))
     perception = EightBitPerception(clip)
     for index, key in enumerate(keys):
@@ -119,10 +124,14 @@ def _write(perception: Perception, folder: Path, index: int, key: str) -> dict[s
     return {"right": middle - start, "write": time.perf_counter() - middle}
 
 
-def _is_there(folder: Path, index: int, key: str) -> bool:
+def _is_there(clip: Clip, folder: Path, index: int, key: str) -> bool:
+    right = clip[index].right
+    others: dict[str, Shape] = {"prev_from_cur": (4, 4)} if index > 0 else {}
+    if right is not None:
+        others["right"] = (3, right.height, right.width)
     try:
-        read_tensors(folder, index, key)
-    except ValueError:  # missing, damaged or of something else: computed anew in each case
+        restore_frame(folder, index, key, (clip[index].height, clip[index].width), others)
+    except ValueError:  # missing, damaged or of something else: computed again in each case
         return False
     return True
 
@@ -130,17 +139,29 @@ def _is_there(folder: Path, index: int, key: str) -> bool:
 def _tidy(folder: Path, frames: int) -> None:
     """Remove what killed processes left half written, and frames that the clip has no more."""
     wanted = {frame_path(folder, index) for index in range(frames)}
-    for path in folder.glob("*.safetensors"):  # hidden ones, too
+    half_written = folder.glob(f".{Path(JSON).stem}.*{Path(JSON).suffix}")
+    for path in (*folder.glob("*.safetensors"), *half_written):  # hidden ones, too
         if path not in wanted:
-            path.unlink()
+            _remove(path)
+
+
+def _remove(path: Path) -> None:
+    """Whatever is there: a file, a link, a folder or nothing."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def _locked(folder: Path, wait: bool) -> Iterator[bool]:
     """Yields whether this process alone may write to the folder."""
+    lock = folder / _LOCK
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / _LOCK).open("a")
+        if lock.exists() and not lock.is_file():
+            _remove(lock)
+        file = lock.open("a")
     except OSError as error:
         raise ValueError(f"{folder}: can't be written ({error.strerror}); `--out` names another folder") from error
     with file:

@@ -1,6 +1,5 @@
 """What `vestcl prepare` computes once, every frame of a clip understood, and how it is read back."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -11,15 +10,11 @@ from numpy.typing import NDArray
 
 from vestcl import times
 from vestcl.geometric.perception import Perception
-from vestcl.io.atomic import read_bytes
-from vestcl.prepared_files import JSON, RECIPE, REMEDY, read_tensors
+from vestcl.prepared_files import ALWAYS, DAMAGE, JSON, damaged, frame_path, read_clip, read_tensors
 from vestcl.scene.layers import Layers
 
 #: Characters that make the last part of a path a pattern.
 _GLOB: Final = frozenset("*?[")
-
-#: Tensors of every frame, but not the right camera's.
-_ALWAYS: Final = ("image", "depth", "mask", "own", "moving", "velocity", "background_image", "background_depth")
 
 Array = NDArray[Any]
 
@@ -66,6 +61,8 @@ class _Frame:
     world_from_cam: NDArray[np.float64] | None
     right: tuple[NDArray[np.float64], NDArray[np.float64]] | None
     """K and right_from_left."""
+    right_size: tuple[int, int] | None
+    """(height, width) px; None is the clip's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,17 +91,15 @@ class PreparedClip:
         Raises:
             ValueError: clip.json is missing, damaged, or of another version of vestcl.
         """
-        path = Path(folder) / JSON
+        folder = Path(folder)
+        about = read_clip(folder)
         try:
-            about = json.loads(read_bytes(path))
-            if about["recipe"] != RECIPE:
-                raise ValueError(f"{path}: must be {RECIPE!r}, got {about['recipe']!r}; {REMEDY}")
             frames = tuple(map(_frame, about["frames"]))
             height, width = map(int, about["size"])
             interval, positions = _times(about["frames"], about["fps"])
-            return cls(Path(folder), about["name"], about["kind"], interval, (height, width), frames, positions)
-        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}: is damaged ({error}); {REMEDY}") from error
+            return cls(folder, about["name"], about["kind"], interval, (height, width), frames, positions)
+        except DAMAGE as error:
+            raise damaged(folder / JSON, error) from error
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -154,10 +149,14 @@ class PreparedClip:
         Raises:
             ValueError: no such frame, or its file is missing or damaged.
         """
-        camera = self._frame(index).right
-        if camera is None:
+        known = self._frame(index)
+        if known.right is None:
             return None
-        return _to_float(self._read(index, "right")["right"]), camera[0].copy(), camera[1].copy()
+        pixels, size = self._read(index, "right")["right"], known.right_size or self.size
+        if pixels.shape[1:] != size:
+            wrong = f"right must be {list(size)}, got {list(pixels.shape[1:])}"
+            raise damaged(frame_path(self.folder, index), wrong)
+        return _to_float(pixels), known.right[0].copy(), known.right[1].copy()
 
     def frame(self, index: int) -> Prepared:
         """All that is known of the frame ``index``, from 0.
@@ -169,7 +168,7 @@ class PreparedClip:
             ValueError: no such frame, or its file is missing or damaged.
         """
         motion = ("prev_from_cur",) if index > 0 else ()
-        known, tensors = self._frame(index), self._read(index, *_ALWAYS, *motion)
+        known, tensors = self._frame(index), self._read(index, *ALWAYS, *motion)
         image, depth = _to_float(tensors["image"]), tensors["depth"][None]
         mask, own, moving = (self._bits(tensors[name]) for name in ("mask", "own", "moving"))
         background_image, background_depth, velocity = image.copy(), depth.copy(), np.zeros_like(image)
@@ -186,7 +185,7 @@ class PreparedClip:
         return self.frames[index]
 
     def _read(self, index: int, *wanted: str) -> dict[str, Array]:
-        return read_tensors(self.folder, index, self._frame(index).key, wanted)
+        return read_tensors(self.folder, index, self._frame(index).key, wanted, self.size)
 
     def _bits(self, packed: Array) -> NDArray[np.bool_]:
         height, width = self.size
@@ -225,9 +224,10 @@ def _times(frames: list[dict[str, Any]], fps: float | None) -> tuple[float | Non
 def _frame(about: dict[str, Any]) -> _Frame:
     pose, right = about["world_from_cam"], about["right"]
     camera = None if right is None else (_matrix(right["K"], 3), _matrix(right["right_from_left"], 4))
-    return _Frame(
-        about["name"], about["key"], _matrix(about["K"], 3), None if pose is None else _matrix(pose, 4), camera
-    )
+    height, width = (right or {}).get("size", (0, 0))
+    size = (int(height), int(width)) if height else None
+    world_from_cam = None if pose is None else _matrix(pose, 4)
+    return _Frame(about["name"], about["key"], _matrix(about["K"], 3), world_from_cam, camera, size)
 
 
 def _matrix(rows: list[list[float]], side: int) -> NDArray[np.float64]:
