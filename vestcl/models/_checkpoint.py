@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from vestcl.io import atomic
 from vestcl.models._weights import check_finite, unwrapped
@@ -23,12 +23,14 @@ KEY: Final = "vestcl.config"
 def write_checkpoint(path: Path | str, config: ModelConfig, state: Mapping[str, torch.Tensor]) -> None:
     """Write both to ``path``, which is the old file or the new one, never half of it.
 
+    The file has the umask's rights; safetensors' own writer leaves it to its owner only.
+
     Raises:
         ValueError: the folder can't be made.
+        OSError: the file can't be written.
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
-    with atomic.replacing(path) as temporary:
-        save_file(tensors, temporary, metadata={KEY: json.dumps(dataclasses.asdict(config))})
+    atomic.write_bytes(path, save(tensors, metadata={KEY: json.dumps(dataclasses.asdict(config))}))
 
 
 def read_checkpoint(path: Path | str) -> tuple[ModelConfig, dict[str, torch.Tensor]]:
