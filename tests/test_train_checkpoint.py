@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import random
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import torch
 from checkpoint_states import configured, state_of, steps
 from forecaster_scenes import TINY, camera, pair_of
 
-from train import checkpoint
+from train import checkpoint, hashes
 from train.checkpoint import CheckpointError, State, list_checkpoints, load_latest, restore_rng, rng_state, save
 from train.config import from_dict
 from vestcl.models.forecaster import Forecaster
@@ -124,6 +125,58 @@ def test_damaged_ones_do_not_count_as_kept(tmp_path: Path) -> None:
     assert steps(tmp_path) == [4, 3]
 
 
+def test_a_save_reads_only_what_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kept checkpoints are hashed when they are written, and never again by this process unless they have changed."""
+    read: list[str] = []
+
+    def counting(path: Path) -> str:
+        read.append(path.name)
+        return hashes_sha256(path)
+
+    hashes_sha256 = hashes.sha256
+    monkeypatch.setattr(hashes, "sha256", counting)
+    for step in range(1, 6):
+        save(tmp_path, state_of(step), keep=3)
+        assert sorted(read) == ["ema.safetensors", "model.safetensors", "state.pt"]
+        read.clear()
+    assert steps(tmp_path) == [5, 4, 3]
+
+
+def test_a_changed_one_does_not_count_as_kept(tmp_path: Path) -> None:
+    """Of the same size, with another byte."""
+    for step in (1, 2):
+        path = save(tmp_path, state_of(step), keep=2)
+    content = bytearray((path / "state.pt").read_bytes())
+    content[100] ^= 1
+    (path / "state.pt").write_bytes(content)
+    save(tmp_path, state_of(3), keep=2)
+    assert steps(tmp_path) == [3, 2, 1]
+
+
+@pytest.mark.parametrize("failing", ["rmtree", "rename", "iterdir"])
+def test_an_old_one_that_cannot_be_removed_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    for step in (1, 2):
+        save(tmp_path, state_of(step), keep=2)
+    rename, iterdir, calls = Path.rename, Path.iterdir, [0]
+
+    def refuse(path: Path, *arguments: Any, **_: Any) -> Any:
+        old = str(path).endswith("step-00000001") or ".step-00000001" in str(path)
+        calls[0] += failing == "iterdir" and path.name == "checkpoints"
+        if (failing in ("rmtree", "rename") and old) or (failing == "iterdir" and calls[0] == 1):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return rename(path, *arguments) if failing == "rename" else iterdir(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil if failing == "rmtree" else Path, failing, refuse)
+        with pytest.warns(UserWarning, match="old checkpoints? .*can't be removed: Permission denied"):
+            save(tmp_path, state_of(3), keep=2)
+    assert steps(tmp_path)[:2] == [3, 2]
+    save(tmp_path, state_of(4), keep=2)
+    assert [path.name for path in sorted((tmp_path / "checkpoints").iterdir())] == ["step-00000003", "step-00000004"]
+
+
 def test_a_step_is_written_once(tmp_path: Path) -> None:
     path = save(tmp_path, state_of(1))
     before = (path / "state.pt").stat().st_mtime_ns
@@ -145,7 +198,7 @@ def tear(out: Path, step: int, name: str = "state.pt") -> Path:
 
 
 @pytest.mark.parametrize("name", ["state.pt", "model.safetensors", "ema.safetensors", "manifest.json"])
-@pytest.mark.parametrize("damage", ["torn", "empty", "absent", "flipped"])
+@pytest.mark.parametrize("damage", ["torn", "empty", "absent", "flipped", "other"])
 def test_a_damaged_one_is_reported_and_the_one_before_it_used(tmp_path: Path, name: str, damage: str) -> None:
     for step in (1, 2):
         save(tmp_path, state_of(step))
@@ -156,6 +209,8 @@ def test_a_damaged_one_is_reported_and_the_one_before_it_used(tmp_path: Path, na
         file.unlink()
     elif damage == "empty":
         file.write_bytes(b"")
+    elif damage == "other":
+        file.write_text('{"format": 1, "files": []}')
     else:
         content = bytearray(file.read_bytes())
         content[len(content) // 2] ^= 0x10

@@ -11,7 +11,6 @@ complete unless the disk itself lost something; sizes and hashes tell. The lates
 pointer that could be wrong. One process writes to a run's folder, any number may read.
 """
 
-import hashlib
 import io
 import json
 import os
@@ -19,9 +18,10 @@ import pickle
 import platform
 import random
 import re
+import secrets
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +31,7 @@ import torch
 from safetensors import SafetensorError
 
 import vestcl
+from train.hashes import known_sha256, sha256
 from vestcl.models._checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models.config import ModelConfig
 
@@ -45,7 +46,9 @@ _MANIFEST: Final = "manifest.json"
 _NAME: Final = re.compile(r"step-(\d{8,})")
 
 #: What reading a checkpoint raises when a file is absent, torn or of another version's making.
-_DAMAGE: Final = (OSError, ValueError, RuntimeError, KeyError, TypeError, pickle.UnpicklingError)
+_DAMAGE: Final = (
+    OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError, EOFError, pickle.UnpicklingError,
+)  # fmt: skip
 
 _MB: Final = 1e6
 
@@ -99,6 +102,8 @@ class State:
     versions: dict[str, str] = field(default_factory=package_versions)
     extra: dict[str, Any] = field(default_factory=dict)
     """Plain containers, numbers, strings and tensors of the caller's."""
+    recent: list[dict[str, float]] = field(default_factory=list)
+    """`train.report.Reporter.recent`: the next row of log.jsonl is a mean over these updates, too."""
 
 
 def list_checkpoints(out: Path | str) -> list[Path]:
@@ -114,6 +119,8 @@ def list_checkpoints(out: Path | str) -> list[Path]:
 
 def save(out: Path | str, state: State, keep: int = 3) -> Path:
     """Write ``state`` beneath ``out`` and remove all that is older than the newest ``keep`` intact checkpoints.
+
+    Once the new one is there, nothing about the old ones is an error: what can't be removed is named in a warning.
 
     Args:
         out: folder of the run; made where it does not exist.
@@ -137,7 +144,7 @@ def save(out: Path | str, state: State, keep: int = 3) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(folder)
-        temporary = folder / f".{path.name}.{os.getpid()}"
+        temporary = folder / f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}"
         temporary.mkdir()
         try:
             _write(temporary, state, rest)
@@ -146,7 +153,10 @@ def save(out: Path | str, state: State, keep: int = 3) -> Path:
             shutil.rmtree(temporary, ignore_errors=True)
     except (OSError, SafetensorError, ValueError) as error:
         raise CheckpointError(_not_written(path, wanted, error)) from error
-    _prune(out, keep)
+    try:
+        _prune(out, keep)
+    except OSError as error:
+        warnings.warn(f"old checkpoints in {folder} can't be removed: {error.strerror or error}", stacklevel=2)
     return path
 
 
@@ -180,7 +190,7 @@ def _step(path: Path) -> int:
 
 def _packed(state: State) -> bytes:
     """All but the weights, as `torch.save` writes it; read back once, for a checkpoint that can't be read is none."""
-    names = ("step", "config", "optimiser", "scheduler", "rng", "versions", "extra")
+    names = ("step", "config", "optimiser", "scheduler", "rng", "versions", "extra", "recent")
     file = io.BytesIO()
     torch.save({name: getattr(state, name) for name in names}, file)
     try:
@@ -202,7 +212,8 @@ def _write(folder: Path, state: State, rest: bytes) -> None:
     if state.ema is not None:
         write_checkpoint(folder / _EMA, state.model_config, state.ema)
     (folder / _STATE).write_bytes(rest)
-    files = {file.name: {"bytes": file.stat().st_size, "sha256": _sha256(file)} for file in sorted(folder.iterdir())}
+    files = {file.name: {"bytes": file.stat().st_size, "sha256": known_sha256(file)} for file in
+             sorted(folder.iterdir())}  # fmt: skip
     (folder / _MANIFEST).write_text(json.dumps({"format": FORMAT, "files": files}, indent=1), encoding="utf-8")
     for path in (*folder.iterdir(), folder):
         _flush(path)
@@ -214,9 +225,9 @@ def _publish(temporary: Path, path: Path) -> None:
         try:
             before = _verified(path)
         except _DAMAGE:
-            shutil.rmtree(path)
+            _remove(path)
         else:
-            if before[_MODEL] != _verified(temporary)[_MODEL]:
+            if before[_MODEL] != _verified(temporary, known_sha256)[_MODEL]:
                 raise ValueError("a checkpoint of that step with other weights is there; choose another `out`")
             return
     temporary.rename(path)
@@ -228,12 +239,10 @@ def _prune(out: Path | str, keep: int) -> None:
     intact = 0
     for path in list_checkpoints(out):
         if intact >= keep:
-            hidden = path.with_name(f".{path.name}.old")
-            path.rename(hidden)
-            shutil.rmtree(hidden)
+            _remove(path)
             continue
         try:
-            _verified(path)
+            _verified(path, known_sha256)
         except _DAMAGE:
             continue
         intact += 1
@@ -242,7 +251,22 @@ def _prune(out: Path | str, keep: int) -> None:
 def _remove_leftovers(folder: Path) -> None:
     """What a process left that was killed while it wrote or removed a checkpoint."""
     for path in folder.glob(".step-*"):
-        shutil.rmtree(path)
+        _remove(path)
+
+
+def _remove(path: Path) -> None:
+    """Hidden first, so that it is not seen in part; where that fails, a warning: it costs room, and no run."""
+    try:
+        hidden = path
+        if not path.name.startswith("."):
+            hidden = path.with_name(f".{path.name}.{secrets.token_hex(4)}.old")
+            path.rename(hidden)
+        if hidden.is_dir():
+            shutil.rmtree(hidden)
+        else:
+            hidden.unlink()
+    except OSError as error:
+        warnings.warn(f"old checkpoint {path} can't be removed: {error.strerror or error}", stacklevel=2)
 
 
 def _read(path: Path) -> State:
@@ -253,30 +277,24 @@ def _read(path: Path) -> State:
     return State(model_config=model_config, model=model, ema=ema, **rest)
 
 
-def _verified(path: Path) -> dict[str, Any]:
-    """The manifest's files, which are as it says.
+def _verified(path: Path, digest: Callable[[Path], str] = sha256) -> dict[str, Any]:
+    """The manifest's files, which are as it says, by their sizes and hashes.
 
     Raises:
-        OSError, ValueError, KeyError, TypeError: they are not.
+        OSError, ValueError, KeyError, TypeError, AttributeError: they are not.
     """
     manifest = json.loads((path / _MANIFEST).read_text(encoding="utf-8"))
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ValueError(f"{_MANIFEST} must be of format {FORMAT}, got {str(manifest)[:50]!r}")
+    if absent := {_MODEL, _STATE} - manifest["files"].keys():
+        raise ValueError(f"{_MANIFEST} must list {' and '.join(sorted(absent))}")
     for name, wanted in manifest["files"].items():
         size = (path / name).stat().st_size
         if size != wanted["bytes"]:
             raise ValueError(f"{name} must have {wanted['bytes']} bytes, got {size}")
-        if _sha256(path / name) != wanted["sha256"]:
+        if digest(path / name) != wanted["sha256"]:
             raise ValueError(f"{name} is not what was written: its SHA-256 differs")
     return dict(manifest["files"])
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def _flush(path: Path) -> None:
