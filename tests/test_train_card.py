@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -204,6 +205,29 @@ def test_figures_of_another_file_are_refused(options: Card, tmp_path: Path, caps
     assert not (tmp_path / "out").exists()
     assert main([str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "`run` must be a folder of train.fit" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff", b"[]", b"{}", b"[" * 100_000, b'{"models": {"x": 1}}'])
+def test_damaged_results_are_a_line(
+    options: Card, tmp_path: Path, content: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "results.json").write_bytes(content)
+    assert main([str(options.run), "--results", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(
+        f"error: {tmp_path / 'results.json'}: must be what train.evaluate writes, with title, models"
+    )
+    assert error.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_a_damaged_log_is_a_line(options: Card, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = shutil.copytree(options.run, tmp_path / "run")
+    with (run / LOG).open("ab") as file:
+        file.write(b"\x00\xff\n")
+    assert main([str(run), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {run / LOG}: line ") and "must be a row of train.fit" in error
+    assert error.count("\n") == 1
 
 
 def test_names_of_results_part_their_sheets(options: Card, tmp_path: Path) -> None:

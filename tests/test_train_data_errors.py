@@ -60,6 +60,15 @@ def test_a_frame_that_cannot_be_read_is_named(tmp_path: Path) -> None:
         windows.batch([Draw(0, 1, 1, False, (0,))])
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_worker_s_error_is_a_line(tmp_path: Path, workers: int) -> None:
+    prepare_clip(Street.generate(3).clip(4, HEIGHT, WIDTH, samples=1), tmp_path / "clip")
+    for path in (tmp_path / "clip").glob("*.safetensors"):
+        path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(ValueError, match=r"^[^\n]*safetensors: is damaged [^\n]*; run `vestcl prepare` again$"):
+        list(loader(WindowSet(find_prepared(tmp_path)), 0, 1, range(2), workers=workers))
+
+
 def test_batches_that_cannot_be_shared_are_refused() -> None:
     windows = fakes(6)
     for batch, rank, world in ((3, 0, 2), (0, 0, 1), (2, 2, 2), (2, -1, 2)):

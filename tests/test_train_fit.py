@@ -2,6 +2,7 @@
 
 import errno
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from train_scenes import MODELS, Processes, configured, steps, street, write_yam
 from train import checkpoint, fit, losses, trainer
 from train.checkpoint import CheckpointError
 from train.fit import STOPPED, TrainingError
-from train.report import LOG, read_log
+from train.report import LOG, Reporter, read_log
 from vestcl.models import ObjectMotion, config
 from vestcl.models._checkpoint import write_checkpoint
 from vestcl.models.forecaster import Forecaster
@@ -149,13 +150,122 @@ def test_the_command_tells_what_is_wrong(
     models: None, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = write_yaml(tmp_path / "run.yaml", tmp_path / "nothing", tmp_path / "out")
-    assert fit.main([str(file)]) == 1
-    assert "error:" in (printed := capsys.readouterr().out) and "nothing" in printed
-    assert fit.main([str(file), "stages.ego.stps=3"]) == 1
-    assert "stps" in capsys.readouterr().out
-    assert fit.main([str(tmp_path / "absent.yaml")]) == 1
-    assert "absent.yaml" in capsys.readouterr().out
+    for arguments, words in (
+        ([str(file)], "nothing: has no prepared clip"),
+        ([str(file), "stages.ego.stps=3"], "stps"),
+        ([str(file), "seed=[[["], "'seed=[[[' must be YAML: line 1, column 4: "),
+        ([str(tmp_path / "absent.yaml")], "absent.yaml"),
+    ):
+        assert fit.main(arguments) == 2
+        printed = capsys.readouterr()
+        assert printed.err.startswith("error: ") and words in printed.err and "error" not in printed.out
     assert not (tmp_path / "out" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize(
+    ("environment", "words"),
+    [
+        ({"RANK": "abc"}, "RANK must be a whole number, 0 or more, as torchrun sets it, got 'abc'"),
+        ({"RANK": "abc", "WORLD_SIZE": "2"}, "RANK must be a whole number"),
+        ({"RANK": "-1", "WORLD_SIZE": "2"}, "RANK must be a whole number"),
+        ({"RANK": "0", "WORLD_SIZE": "0"}, "WORLD_SIZE must be a whole number, 1 or more"),
+        ({"RANK": "2", "WORLD_SIZE": "2"}, "RANK must be below WORLD_SIZE, 2, got 2"),
+        ({"RANK": "0", "WORLD_SIZE": "1", "LOCAL_RANK": "first"}, "LOCAL_RANK must be a whole number"),
+        ({"RANK": "0", "WORLD_SIZE": "1"}, "MASTER_ADDR must be set"),
+        ({"RANK": "0", "WORLD_SIZE": "1", "MASTER_ADDR": "localhost"}, "MASTER_PORT must be set"),
+        ({"RANK": "0", "WORLD_SIZE": "1", "MASTER_ADDR": "localhost", "MASTER_PORT": "99999"}, "MASTER_PORT must be"),
+        ({"TORCHELASTIC_RESTART_COUNT": "x"}, "TORCHELASTIC_RESTART_COUNT must be a whole number"),
+    ],
+)
+def test_a_wrong_environment_is_a_line(
+    environment: dict[str, str], words: str, models: None, cache: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT", "TORCHELASTIC_RESTART_COUNT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert fit.main([str(write_yaml(tmp_path / "run.yaml", cache, tmp_path / "out"))]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {words}") and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("raised", "words"),
+    [
+        ("DataLoader worker (pid 17) is killed by signal: Killed. ", "a process that reads data was killed"),
+        ("DataLoader worker (pid(s) 17) exited unexpectedly", "a process that reads data was killed"),
+    ],
+)
+def test_a_lost_worker_is_a_line(
+    raised: str, words: str, models: None, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    def lost(*_: Any, **__: Any) -> None:
+        raise RuntimeError(raised)
+
+    monkeypatch.setattr(fit, "fit", lost)
+    assert fit.main([str(write_yaml(tmp_path / "run.yaml", cache, tmp_path / "out"))]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {words}")
+
+
+# ---------------------------------------------------------------- the log
+
+
+def test_a_resumed_run_logs_the_rows_of_a_straight_one(
+    models: None, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A row is a mean over three updates, some of them before the checkpoint that the run is resumed from."""
+
+    def rows(out: Path) -> list[dict[str, Any]]:
+        return [{k: v for k, v in row.items() if not k.startswith("s_")} for row in read_log(out / LOG)]
+
+    settings = {"log_every": 3, "checkpoint_every": 4}
+    assert run(cache, tmp_path / "straight", run=settings)
+    updated = Reporter.updated
+
+    def dying(self: Reporter, step: int, *arguments: Any) -> None:
+        updated(self, step, *arguments)
+        if step == 5:
+            raise InterruptedError
+
+    monkeypatch.setattr(Reporter, "updated", dying)
+    with pytest.raises(InterruptedError):
+        run(cache, tmp_path / "resumed", run=settings)
+    assert steps(tmp_path / "resumed") == [4]
+    monkeypatch.setattr(Reporter, "updated", updated)
+    assert run(cache, tmp_path / "resumed", run=settings, go_on=True)
+    assert [row["step"] for row in rows(tmp_path / "straight")] == [3, 6, 8]
+    assert rows(tmp_path / "resumed") == rows(tmp_path / "straight")
+
+
+def test_a_damaged_log_is_a_line(models: None, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_yaml(tmp_path / "run.yaml", cache, tmp_path / "out", run={"threads": None})
+    assert fit.main([str(file)]) == 0
+    log = tmp_path / "out" / LOG
+    log.write_bytes(log.read_bytes().replace(b'{"step": 2,', b'\x00\xff{"step": 2,'))
+    capsys.readouterr()
+    assert fit.main([str(file), "--resume"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {log}: line 2 must be a row of train.fit, got ") and error.count("\n") == 1
+
+
+def test_an_old_checkpoint_that_stays_ends_no_run(
+    models: None, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def busy(path: Path, ignore_errors: bool = False) -> None:
+        if not ignore_errors:
+            raise OSError(errno.EBUSY, os.strerror(errno.EBUSY))
+
+    monkeypatch.setattr(checkpoint.shutil, "rmtree", busy)
+    file = write_yaml(tmp_path / "run.yaml", cache, tmp_path / "out", run={"threads": None, "keep": 2})
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)
+        assert fit.main([str(file)]) == 0
+    assert steps(tmp_path / "out") == [8, 6]
+    lines = [line for line in capsys.readouterr().err.splitlines() if line]
+    assert lines and all(line.startswith("warning: old checkpoint ") for line in lines)
+    assert "step-00000002 can't be removed: Device or resource busy" in lines[0]
 
 
 # ---------------------------------------------------------------- no number

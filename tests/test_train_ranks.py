@@ -10,10 +10,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import distributed
 from train_scenes import MODELS, MOMENT, ROOT, configured, steps, street, weights, write_yaml
 
 from train import fit
-from train.ranks import Ranks
+from train.fit import TrainingError
+from train.ranks import LostProcessError, Ranks, lost_processes_named
 from train.report import LOG, read_log
 from train.trainer import build_model
 from vestcl import runtime
@@ -80,6 +82,26 @@ def test_alone_nothing_is_shared(monkeypatch: pytest.MonkeyPatch) -> None:
     assert ranks.any(True) and not ranks.any(False)
     assert ranks.mean({"loss": 2.0}) == {"loss": 2.0}
     ranks.leave()
+
+
+@pytest.mark.parametrize(
+    "raised",
+    [
+        RuntimeError("[../third_party/gloo/gloo/transport/tcp/pair.cc:547] Connection closed by peer [::1]:9\nframes"),
+        distributed.DistNetworkError("The client socket has failed to connect\nException raised from ..."),
+    ],
+)
+def test_a_lost_process_is_a_line(raised: RuntimeError) -> None:
+    line = r"^another process of this run can't be reached or has ended \([^\n]*\)$"
+    with pytest.raises(LostProcessError, match=line), lost_processes_named():
+        raise raised
+
+
+def test_other_errors_stay_what_they_are() -> None:
+    for raised in (RuntimeError("shapes differ"), TrainingError("timed out"), ValueError("gloo")):
+        with pytest.raises(type(raised)) as caught, lost_processes_named():
+            raise raised
+        assert caught.value is raised
 
 
 def test_a_restart_is_known(monkeypatch: pytest.MonkeyPatch) -> None:

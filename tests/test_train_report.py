@@ -4,7 +4,8 @@ import errno
 import json
 import os
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -40,6 +41,11 @@ def batch_of() -> Batch:
     prior = measured(2, HEIGHT, WIDTH)
     target, path = torch.rand(2, 3, HEIGHT, WIDTH), torch.eye(4).repeat(2, 3, 1, 1)
     return Batch(prev, cur, K, prior, 3, target, eye, K, eye, path, known, ("a/001", "b/002"))
+
+
+def batch_of_nothing() -> Batch:
+    """For updates without an image."""
+    return cast(Batch, SimpleNamespace(horizon=1, clips=()))
 
 
 def view_of(image: torch.Tensor) -> RenderedView:
@@ -96,6 +102,35 @@ def test_a_resumed_log_is_cut(tmp_path: Path) -> None:
     assert [(row["step"], row["loss"]) for row in read_log(out / LOG)] == [(2, 1.0), (4, 1.0), (6, 2.0), (8, 2.0)]
     for line in (out / LOG).read_text().splitlines():
         json.loads(line)
+
+
+def test_a_resumed_row_is_a_mean_over_all_its_updates(tmp_path: Path) -> None:
+    """Also over those before the checkpoint, however many updates a row has."""
+    first = Reporter(settings(tmp_path, log_every=60, image_every=0), 0, Console(quiet=True), True)
+    with first.bar(0):
+        for step in range(1, 58):
+            first.updated(step, "ego", 1e-3, update_of(float(step)), 0.1, batch_of_nothing())
+    second = Reporter(settings(tmp_path, log_every=60, image_every=0), 57, Console(quiet=True), True, first.recent)
+    with second.bar(57):
+        for step in range(58, 61):
+            second.updated(step, "ego", 1e-3, update_of(float(step)), 0.1, batch_of_nothing())
+    row = read_log(tmp_path / LOG)[-1]
+    assert (row["step"], row["loss"]) == (60, pytest.approx(30.5))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"", b"\x00\x00", b"\xff\xfe", b"nothing", b"[1]", b"3", b'{"stage": "ego"}', b'{"step": "1", "stage": "ego"}',
+        b'{"step": -1, "stage": "ego"}', b'{"step": 1}', b'{"step": 1, "stage": "ego", "loss": "low"}',
+        b'{"step": true, "stage": "ego"}', b"[" * 100_000, b'{"step": 1, "stage": "ego", "loss": ' + b"9" * 5000 + b"}",
+    ],
+)  # fmt: skip
+def test_a_line_that_is_no_row_is_named(tmp_path: Path, line: bytes) -> None:
+    path = tmp_path / LOG
+    path.write_bytes(b'{"step": 1, "stage": "ego", "loss": null}\n' + line + b"\n")
+    with pytest.raises(ValueError, match=r"log.jsonl: line 2 must be a row of train.fit, got b?'[^\n]{0,200}; remove"):
+        read_log(path)
 
 
 def test_no_number_is_null(tmp_path: Path) -> None:

@@ -66,18 +66,28 @@ def _read(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     if not path.is_file():
         builds = f", which {above[-1]} builds on" if above else ""
         raise FileNotFoundError(f"no configuration at {path}{builds}")
-    settings = _parse(path.read_text(encoding="utf-8"), str(path))
+    settings = _parse(_text_of(path), str(path))
     if not isinstance(settings, dict):
         raise ValueError(f"{path} must hold a mapping of keys to values, got {type(settings).__name__}")
     base = settings.pop(BASE, None)
     return settings if base is None else merged(_read(path.parent / str(base), (*above, path)), settings)
 
 
+def _text_of(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} must be YAML in UTF-8: {error.reason} at byte {error.start}") from error
+
+
 def _parse(text: str, source: str) -> Any:
     try:
         return yaml.load(text, _Loader)
-    except yaml.YAMLError as error:
-        raise ValueError(f"{source} must be YAML: {error}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        said = getattr(error, "problem", None) or (str(error).splitlines() or [""])[0]
+        mark = getattr(error, "problem_mark", None)
+        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        raise ValueError(f"{source} must be YAML: {where}{said}") from error
 
 
 def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:

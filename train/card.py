@@ -17,12 +17,12 @@ from typing import Any, Final
 
 import tyro
 import yaml
-from rich.console import Console
 
 from train import card_pictures, checkpoint
 from train.card_pictures import Rows
 from train.card_tables import Weights, about_model, data_table, prepare_commands, result_tables, training_table
-from train.checkpoint import CheckpointError, State
+from train.checkpoint import State
+from train.command import ERRORS, failed, warnings_in_lines
 from train.config import Config, from_dict
 from train.evaluate import Evaluation
 from train.protocols import PROTOCOLS
@@ -33,6 +33,12 @@ from vestcl.pretrained import find_model
 
 #: Rows of the log that is kept beside the card: a curve of some hundred pixels has no use for more.
 LOG_ROWS: Final = 300
+
+#: What of a results.json a card is made of.
+_RESULTS: Final = {
+    "title": str, "models": dict, "settings": dict, "weights": dict, "machine": dict, "intervals": dict,
+    "differences": dict, "clips": dict, "windows": list,
+}  # fmt: skip
 
 _TEMPLATE: Final = Path(__file__).with_name("card.md")
 
@@ -63,12 +69,12 @@ class Card:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; what a user can put right is told in one line, with exit code 2."""
     options = tyro.cli(Card, prog="python -m train.card", description=__doc__, args=arguments)
-    try:
-        for path in write_card(options):
-            print(path)
-    except (ValueError, OSError, CheckpointError) as error:
-        Console(stderr=True).print(f"error: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
-        return 2
+    with warnings_in_lines():
+        try:
+            for path in write_card(options):
+                print(path)
+        except ERRORS as error:
+            return failed(error)
     return 0
 
 
@@ -145,7 +151,7 @@ def _weights(path: Path) -> Weights:
 def _results(options: Card, weights: Weights) -> Results:
     found: Results = []
     for folder in options.results:
-        told = json.loads(read_bytes(folder / "results.json"))
+        told = _read_results(folder / "results.json")
         known = {model["sha256"] for model in told["models"].values()}
         if weights.sha256 not in known:
             hashes = ", ".join(sorted(sha[:16] for sha in known)) or "no model"
@@ -155,6 +161,17 @@ def _results(options: Card, weights: Weights) -> Results:
     if len(set(names)) < len(names):
         raise ValueError(f"`results` must be folders of different names, got {', '.join(names)}")
     return found
+
+
+def _read_results(path: Path) -> dict[str, Any]:
+    try:
+        told = json.loads(read_bytes(path))
+        fits = all(isinstance(told[name], kind) for name, kind in _RESULTS.items())
+        if fits and all(isinstance(model["sha256"], str) for model in told["models"].values()):
+            return dict(told)
+    except (json.JSONDecodeError, UnicodeDecodeError, LookupError, TypeError, AttributeError, RecursionError):
+        pass
+    raise ValueError(f"{path}: must be what train.evaluate writes, with {', '.join(_RESULTS)}; evaluate again")
 
 
 def _text(options: Card, state: State, rows: Rows, weights: Weights, results: Results) -> str:

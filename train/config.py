@@ -192,7 +192,7 @@ class Config:
     """A name that `vestcl.models.configuration` knows, with its variants ("vest-s+no-omf")."""
     init: Path | None = None
     """A model's file to start from; null starts from random weights."""
-    seed: CountOrNone = 0
+    seed: Annotated[int, Strict(), Field(ge=0, lt=2**63)] = 0
     optimiser: OptimiserConfig = OptimiserConfig()
     run: RunConfig = RunConfig()
 

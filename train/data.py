@@ -2,7 +2,7 @@
 else: there is no state to save, ranks share a batch without talking, and a resumed run sees what it would have seen."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeVar
 
@@ -251,8 +251,11 @@ class WindowSet:
 
 
 @dataclass(frozen=True, eq=False)
-class _Steps(Dataset[Batch]):
-    """A rank's part of each step's batch: positions rank, rank + world, ..."""
+class _Steps(Dataset[Batch | ValueError]):
+    """A rank's part of each step's batch: positions rank, rank + world, ...
+
+    What can't be read is given as the error itself: torch would put a worker's traceback into its message.
+    """
 
     windows: WindowSet
     seed: int
@@ -260,13 +263,26 @@ class _Steps(Dataset[Batch]):
     rank: int
     world: int
 
-    def __getitem__(self, step: int) -> Batch:
-        return self.windows.batch(self.windows.global_batch(self.seed, step, self.batch)[self.rank :: self.world])
+    def __getitem__(self, step: int) -> Batch | ValueError:
+        try:
+            return self.windows.batch(self.windows.global_batch(self.seed, step, self.batch)[self.rank :: self.world])
+        except ValueError as error:
+            return error
+
+
+class _Batches(DataLoader[Batch | ValueError]):
+    """Raises what `_Steps` gives as an error."""
+
+    def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
+        for batch in super().__iter__():
+            if isinstance(batch, ValueError):
+                raise batch
+            yield batch
 
 
 def loader(
     windows: WindowSet, seed: int, batch: int, steps: range, *, rank: int = 0, world: int = 1, workers: int = 0
-) -> DataLoader[Batch]:
+) -> Iterable[Batch]:
     """The batches of ``steps``, one after the other.
 
     Args:
@@ -288,7 +304,7 @@ def loader(
         raise ValueError(
             f"`batch` must be a multiple of the {world} processes and `rank` one of them, got {batch}, {rank}"
         )
-    return DataLoader(
+    return _Batches(
         _Steps(windows, seed, batch, rank, world),
         batch_size=None,
         sampler=steps,

@@ -23,13 +23,13 @@ from typing import Any, Final
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.text import Text
 
 from train import evaluate_report as report
+from train.command import ERRORS, failed
 from train.evaluate_sheets import write_sheets
 from train.evaluate_windows import PART_WINDOWS, Part, Setup, known_of, plan, prepared, read_part, run_part
 from train.protocols import HELD_OUT, PROTOCOLS, Name, Protocol, Source, Where
-from train.ranks import Ranks
+from train.ranks import Ranks, local_rank
 from vestcl import __version__, runtime
 from vestcl.bench import _results
 from vestcl.io.atomic import write_bytes
@@ -103,9 +103,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     config = tyro.cli(Evaluation, prog="python -m train.evaluate", description=__doc__, args=arguments)
     try:
         evaluate(config)
-    except (runtime.DeviceError, ValueError, OSError) as error:
-        Console(stderr=True).print(Text(f"error: {error}", style="red"), soft_wrap=True)
-        return 2
+    except ERRORS as error:
+        return failed(error)
     return 0
 
 
@@ -127,7 +126,7 @@ def evaluate(config: Evaluation) -> None:
     about = _about(config, protocol)
     parts = plan(sources, protocol, setup.steps, config.every, out / "clips", _key(about))
     console = _results.console(WIDTH)
-    device = config.device or Ranks(local=int(os.environ.get("LOCAL_RANK", "0"))).device()
+    device = config.device or Ranks(local=local_rank()).device()
     with runtime.use(device) as session:
         if not config.merge:
             _run(parts[rank::ranks], setup, console)

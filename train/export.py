@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from rich.console import Console
-from rich.text import Text
 
+from train.command import ERRORS, failed
 from vestcl.models._checkpoint import write_checkpoint
 from vestcl.pretrained import load_model
 
@@ -30,9 +29,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = tyro.cli(Export, args=arguments, description=__doc__, prog="python -m train.export")
     try:
         export(options.checkpoint, options.out)
-    except (ValueError, OSError) as error:
-        Console(stderr=True).print(Text(f"error: {error}", style="red"), soft_wrap=True)
-        return 2
+    except ERRORS as error:
+        return failed(error)
     return 0
 
 

@@ -10,7 +10,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -22,10 +22,11 @@ from rich.console import Console
 
 from train import checkpoint, resume
 from train.checkpoint import CheckpointError, State
+from train.command import ERRORS, failed, lost_worker, warnings_in_lines
 from train.config import Config, DataConfig, load_config, to_dict
 from train.data import WindowSet, loader
 from train.losses import build_perceptual
-from train.ranks import Ranks
+from train.ranks import Ranks, lost_processes_named
 from train.report import Reporter
 from train.trainer import Average, NotANumberError, Trainer, build_model
 from vestcl import runtime
@@ -57,15 +58,23 @@ class Options:
 def main(arguments: list[str] | None = None) -> int:
     """The command; its exit status."""
     options = tyro.cli(Options, args=arguments, description=__doc__, prog="python -m train.fit")
+    with warnings_in_lines():
+        try:
+            return 0 if _fit(options) else STOPPED
+        except (*ERRORS, TrainingError) as error:
+            return failed(error)
+        except RuntimeError as error:
+            if (line := lost_worker(error)) is None:
+                raise
+            return failed(line)
+
+
+def _fit(options: Options) -> bool:
     ranks = Ranks.join()
-    console = Console(stderr=not ranks.first)
     try:
         config = load_config(options.config, options.overrides)
-        finished = fit(config, go_on=options.resume or ranks.restarted, ranks=ranks, device=options.device)
-        return 0 if finished else STOPPED
-    except (ValueError, OSError, runtime.DeviceError, TrainingError, CheckpointError) as error:
-        console.print(f"error: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
-        return 1
+        with lost_processes_named() if ranks.world > 1 else nullcontext():
+            return fit(config, go_on=options.resume or ranks.restarted, ranks=ranks, device=options.device)
     finally:
         ranks.leave()
 
@@ -86,6 +95,7 @@ def fit(config: Config, *, go_on: bool = False, ranks: Ranks | None = None, devi
         ValueError: data or weights that can't be used, a run that exists already, or another one's checkpoint.
         TrainingError: a loss or gradient that is no number.
         CheckpointError: the last checkpoint can't be written, or none can be read.
+        ChildProcessError: a process that reads data was killed.
     """
     ranks = ranks or Ranks()
     state = _last_state(config, go_on)
@@ -139,7 +149,8 @@ class _Run:
         """From ``state`` to the end; whether that was reached."""
         if state is not None:
             self._restore(state)
-        self.report = Reporter(self.config, self.step, Console(), self.ranks.first)
+        recent = state.recent if state else ()
+        self.report = Reporter(self.config, self.step, Console(), self.ranks.first, recent)
         self.report.say(self._about())
         with self.report.bar(self.step):
             while self.step < self.config.steps:
@@ -194,7 +205,7 @@ class _Run:
         count = self.average.count if self.average else 0
         state = State(
             self.step, to_dict(self.config), self.model.config, self.model.state_dict(), ema, adam, schedule,
-            extra={"averaged": count},
+            extra={"averaged": count}, recent=self.report.recent,
         )  # fmt: skip
         try:
             checkpoint.save(self.config.out, state, self.config.run.keep)

@@ -2,6 +2,9 @@
 
 import gc
 import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Final
@@ -16,6 +19,16 @@ from vestcl import runtime
 #: A process that does not answer for so long is given up, and torchrun starts all of them anew.
 PATIENCE: Final = timedelta(minutes=10)
 
+#: The largest TCP port.
+_PORTS: Final = 65_535
+
+#: What gloo's errors, plain RuntimeErrors, have in their text when another process is gone.
+_GONE: Final = re.compile(r"gloo|connection (closed|reset|refused)|broken pipe|timed? ?out", re.IGNORECASE)
+
+
+class LostProcessError(RuntimeError):
+    """Another process of the run could not be reached, or is gone."""
+
 
 @dataclass(frozen=True)
 class Ranks:
@@ -28,14 +41,24 @@ class Ranks:
 
     @classmethod
     def join(cls) -> "Ranks":
-        """What torchrun's environment says, once all processes have met (gloo); alone without it."""
+        """The rank that torchrun's environment gives, once all processes have met (gloo); rank 0 of 1 without it.
+
+        Raises:
+            ValueError: a variable that is absent or no such number; the message names it.
+            LostProcessError: the other processes can't be reached.
+        """
+        rank, world, local = _variable("RANK", 0), _variable("WORLD_SIZE", 1, least=1), local_rank()
         if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
             return cls()
+        if rank >= world:
+            raise ValueError(f"RANK must be below WORLD_SIZE, {world}, got {rank}")
         if not distributed.is_initialized():
-            store, rank, world = next(rendezvous("env://", timeout=PATIENCE))
-            fresh = PrefixStore(f"start {_restarts()}", store)  # torchrun's has the lost ones' addresses
-            distributed.init_process_group("gloo", timeout=PATIENCE, store=fresh, rank=rank, world_size=world)
-        return cls(distributed.get_rank(), distributed.get_world_size(), int(os.environ.get("LOCAL_RANK", "0")))
+            _check_address()
+            with lost_processes_named():
+                store, rank, world = next(rendezvous("env://", timeout=PATIENCE))
+                fresh = PrefixStore(f"start {_restarts()}", store)  # torchrun's has the lost ones' addresses
+                distributed.init_process_group("gloo", timeout=PATIENCE, store=fresh, rank=rank, world_size=world)
+        return cls(distributed.get_rank(), distributed.get_world_size(), local)
 
     @property
     def first(self) -> bool:
@@ -84,6 +107,44 @@ class Ranks:
             distributed.destroy_process_group()
 
 
+@contextmanager
+def lost_processes_named() -> Iterator[None]:
+    """Inside the ``with`` block torch's errors about other processes become LostProcessErrors of one line."""
+    try:
+        yield
+    except RuntimeError as error:
+        is_gloos = type(error) is RuntimeError and _GONE.search(str(error))
+        if not is_gloos and not isinstance(error, distributed.DistError):
+            raise
+        reason = str(error).partition("\n")[0]
+        raise LostProcessError(f"another process of this run can't be reached or has ended ({reason})") from error
+
+
+def local_rank() -> int:
+    """This process among those of its machine, by torchrun's environment; 0 without it.
+
+    Raises:
+        ValueError: LOCAL_RANK is no such number.
+    """
+    return _variable("LOCAL_RANK", 0)
+
+
 def _restarts() -> int:
     """How often torchrun has started the processes again."""
-    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
+    return _variable("TORCHELASTIC_RESTART_COUNT", 0)
+
+
+def _check_address() -> None:
+    """Raises a ValueError where the address that processes meet at is not given."""
+    if not os.environ.get("MASTER_ADDR"):
+        raise ValueError("MASTER_ADDR must be set, to the first process's machine, where RANK and WORLD_SIZE are")
+    if (port := _variable("MASTER_PORT", 0)) > _PORTS or "MASTER_PORT" not in os.environ:
+        raise ValueError(f"MASTER_PORT must be set, to 0 ... {_PORTS}, where RANK and WORLD_SIZE are, got {port}")
+
+
+def _variable(name: str, default: int, least: int = 0) -> int:
+    """The whole number that the environment has as ``name``."""
+    text = os.environ.get(name, str(default))
+    if not re.fullmatch(r"[0-9]{1,9}", text) or int(text) < least:
+        raise ValueError(f"{name} must be a whole number, {least} or more, as torchrun sets it, got {text[:40]!r}")
+    return int(text)

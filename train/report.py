@@ -2,7 +2,7 @@
 
 import json
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -25,16 +25,32 @@ LOG: Final = "log.jsonl"
 #: Losses on the bar are means over so many updates.
 _SMOOTHED: Final = 50
 
+#: Bytes of a damaged line that its error shows.
+_SHOWN: Final = 40
+
 #: Columns of a sheet of a training image, px.
 _CELL: Final = 416
 
 
 class Reporter:
-    """Of the run ``config`` from ``step`` on; in processes other than the first it is silent."""
+    """Of the run ``config`` from ``step`` on; in processes other than the first it is silent.
 
-    def __init__(self, config: Config, step: int, console: Console, speaks: bool) -> None:
+    Args:
+        config: of the run.
+        step: updates done.
+        console: where lines and the bar go.
+        speaks: whether this process is the first.
+        recent: of the reporter that a resumed run's checkpoint is from; its updates count in the next row's means.
+
+    Raises:
+        ValueError: the run's log.jsonl has a line that is no row.
+    """
+
+    def __init__(
+        self, config: Config, step: int, console: Console, speaks: bool, recent: Iterable[Mapping[str, float]] = ()
+    ) -> None:
         self.console, self._speaks, self._config = console, speaks, config
-        self._recent: deque[Mapping[str, float]] = deque(maxlen=_SMOOTHED)
+        self._recent = deque(recent, maxlen=max(_SMOOTHED, config.run.log_every))
         self._silenced = False
         if speaks:
             config.out.mkdir(parents=True, exist_ok=True)
@@ -73,6 +89,11 @@ class Reporter:
         if update.skipped:
             self.say(f"step {step}: no number, skipped ({', '.join(batch.clips)})", "yellow")
 
+    @property
+    def recent(self) -> list[dict[str, float]]:
+        """Scalars of the last updates, for the reporter of a resumed run."""
+        return [dict(update) for update in self._recent]
+
     def say(self, text: str, style: str = "") -> None:
         """A line above the bar."""
         if self._speaks:
@@ -100,7 +121,7 @@ class Reporter:
         return _means_of(list(self._recent)[-self._config.run.log_every :])
 
     def _described(self, stage: str) -> str:
-        means = _means_of(self._recent)
+        means = _means_of(list(self._recent)[-_SMOOTHED:])
         split = "+".join(f"{means[f's_{name}']:.2f}" for name in ("data", "networks", "splatting"))
         return f"{stage}  loss {means['loss']:.4f}  l1 {means.get('l1', 0):.4f}  {split} s data+networks+splatting"
 
@@ -140,9 +161,33 @@ def training_sheet(batch: Batch, view: RenderedView, title: str) -> sheet.Pictur
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """The rows of a log.jsonl; a last line that a killed process left half written is left out."""
-    lines = path.read_text().split("\n")[:-1]
-    return [json.loads(line) for line in lines]
+    """The rows of a log.jsonl; a last line that a killed process left half written is left out.
+
+    Raises:
+        ValueError: a line is no row; the message has the file and the line's number.
+        OSError: the file can't be read.
+    """
+    lines = path.read_bytes().split(b"\n")[:-1]
+    return [_row(path, number, line) for number, line in enumerate(lines, start=1)]
+
+
+def _row(path: Path, number: int, line: bytes) -> dict[str, Any]:
+    try:
+        row = json.loads(line)
+        if row["step"] >= 0 and all(_fits(name, value) for name, value in row.items()) and "stage" in row:
+            return dict(row)
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        pass
+    got = line[:_SHOWN].decode(errors="replace")
+    raise ValueError(f"{path}: line {number} must be a row of train.fit, got {got!r}; remove this line")
+
+
+def _fits(name: str, value: Any) -> bool:
+    """Whether a row may have the entry: a stage's name, whole numbers, and numbers or null for what is not finite."""
+    if name == "stage":
+        return isinstance(value, str)
+    kinds = (int,) if name in ("step", "horizon") else (int, float, type(None))
+    return isinstance(value, kinds) and not isinstance(value, bool)
 
 
 def _cut_log(path: Path, step: int) -> None:
