@@ -31,6 +31,7 @@ def state_of(step: int, seed: int = 0, **fields: Any) -> State:
         "state": {0: {"exp_avg": weights["a.weight"] * 3, "step": torch.tensor(float(step))}},
         "param_groups": [],
     }
+    fields = {"trained_on": {"street 3": (0, step)}, **fields}
     return State(step, to_dict(configured()), TINY, weights, ema, moments, {"last_epoch": step}, **fields)
 
 

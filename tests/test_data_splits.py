@@ -1,5 +1,6 @@
 """vestcl.data.splits."""
 
+import numpy as np
 import pytest
 
 from vestcl.data import splits
@@ -12,6 +13,16 @@ def test_published_sizes() -> None:
     assert [len(drives) for drives in views] == [20, 4, 4]
     assert sorted(sum(views, ())) == sorted(train + test) and len(set(sum(views, ()))) == 28
     assert test[0] == "2011_09_26_drive_0060_sync" and train[-1] == "2011_09_29_drive_0071_sync"
+
+
+def test_the_views_split_is_the_published_shuffle() -> None:
+    """Of the 28 drives in order, by NumPy's generator of seed 0: 70 % train, 15 % validate, the rest test."""
+    drives = sorted(splits.KITTI_PREDICTION_TRAIN + splits.KITTI_PREDICTION_TEST)
+    np.random.RandomState(0).shuffle(drives)
+    train, val = round(0.7 * len(drives)), round(0.15 * len(drives))
+    assert sorted(splits.KITTI_VIEWS_TRAIN) == sorted(drives[:train])
+    assert sorted(splits.KITTI_VIEWS_VAL) == sorted(drives[train : train + val])
+    assert sorted(splits.KITTI_VIEWS_TEST) == sorted(drives[train + val :])
 
 
 def test_windows_of_the_published_test_drives() -> None:

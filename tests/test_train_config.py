@@ -9,11 +9,29 @@ from typing import Any
 import pytest
 
 from train.config import Config, DataConfig, Stage, from_dict, load_config, to_dict
+from vestcl.data.splits import (
+    CITYSCAPES_TRAIN_SNIPPETS,
+    KITTI_PREDICTION_TEST,
+    KITTI_PREDICTION_TRAIN,
+    KITTI_TRAINING,
+    KITTI_VIEWS_TEST,
+    KITTI_VIEWS_TRAIN,
+    KITTI_VIEWS_VAL,
+)
 
 CONFIGS = sorted((Path(__file__).resolve().parents[1] / "train" / "configs").glob("*.yaml"))
 
 #: What shipped files may leave open; each tells in its first lines what it does.
 OPEN = ("out=runs/a", "data.train=[prepared/*]", "loss.perceptual.weights=trunk.pth")
+
+#: Frames of the left camera in KITTI raw's city drives, by day and number.
+KITTI_FRAMES = {
+    "09_260001": 108, "09_260002": 77, "09_260005": 154, "09_260009": 447, "09_260011": 233, "09_260013": 144,
+    "09_260014": 314, "09_260017": 114, "09_260018": 270, "09_260048": 22, "09_260051": 438, "09_260056": 294,
+    "09_260057": 361, "09_260059": 373, "09_260060": 78, "09_260084": 383, "09_260091": 340, "09_260093": 433,
+    "09_260095": 268, "09_260096": 475, "09_260104": 312, "09_260106": 227, "09_260113": 87, "09_260117": 660,
+    "09_280001": 106, "09_280002": 376, "09_290026": 158, "09_290071": 1059,
+}  # fmt: skip
 
 SMALL = """
 name: small
@@ -37,6 +55,30 @@ def error_of(path: Path, *overrides: str) -> str:
     with pytest.raises(ValueError) as caught:  # noqa: PT011 - its words are what is tested
         load_config(path, overrides)
     return str(caught.value)
+
+
+def test_the_papers_epochs() -> None:
+    """300 epochs at batch 4; frames of each drive as KITTI raw's release has them."""
+    steps = {path.stem: load_config(path, OPEN).steps for path in CONFIGS if path.stem.startswith("vest-paper")}
+    frames = {
+        drive: KITTI_FRAMES[drive[5:10] + drive[17:21]] for drive in KITTI_PREDICTION_TRAIN + KITTI_PREDICTION_TEST
+    }
+    assert sum(frames.values()) == 8311
+    for name, drives in (("kitti", KITTI_PREDICTION_TRAIN), ("kitti-views", KITTI_VIEWS_TRAIN)):
+        windows = sum(frames[drive] - 2 for drive in drives)
+        assert steps[f"vest-paper_{name}"] == 300 * windows // 4
+    assert steps["vest-paper_cityscapes"] == 300 * CITYSCAPES_TRAIN_SNIPPETS // 4
+    assert (
+        CITYSCAPES_TRAIN_SNIPPETS == 2975 and "2,945" in (CONFIGS[0].parent / "vest-paper_cityscapes.yaml").read_text()
+    )
+
+
+def test_each_split_of_kitti_has_its_configuration() -> None:
+    of = {path.stem: load_config(path, OPEN).data.split for path in CONFIGS}
+    assert (of["vest-paper_kitti"], of["vest-paper_kitti-views"]) == ("kitti-prediction", "kitti-views")
+    assert not set(KITTI_TRAINING["kitti-views"]) & {*KITTI_VIEWS_TEST, *KITTI_VIEWS_VAL}
+    assert not set(KITTI_TRAINING["kitti-prediction"]) & set(KITTI_PREDICTION_TEST)
+    assert of["vest-s_street"] is None
 
 
 def test_a_file_and_its_defaults(small: Path) -> None:
@@ -179,7 +221,7 @@ def test_configurations_are_frozen(small: Path) -> None:
 
 def test_the_shipped_ones_are_there() -> None:
     sets = {f"{model}_{data}" for model in ("vest-s", "vest-paper") for data in ("street", "kitti", "cityscapes")}
-    assert {path.stem for path in CONFIGS} == sets | {"vest-s_kitti-clip", "ablation_street"}
+    assert {path.stem for path in CONFIGS} == sets | {"vest-paper_kitti-views", "vest-s_kitti-clip", "ablation_street"}
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)

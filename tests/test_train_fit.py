@@ -1,5 +1,6 @@
 """train.fit: nothing is lost when a run is killed or told to stop, and what breaks is told of."""
 
+import dataclasses
 import errno
 import os
 import warnings
@@ -11,13 +12,17 @@ import pytest
 import torch
 from train_scenes import MODELS, Processes, configured, steps, street, write_yaml
 
-from train import checkpoint, fit, losses, trainer
+from train import checkpoint, export, fit, losses, trainer
 from train.checkpoint import CheckpointError
+from train.config import DataConfig
 from train.fit import STOPPED, TrainingError
 from train.report import LOG, Reporter, read_log
+from vestcl.data import Street
+from vestcl.data.splits import KITTI_VIEWS_TEST, KITTI_VIEWS_TRAIN
 from vestcl.models import ObjectMotion, config
-from vestcl.models._checkpoint import write_checkpoint
+from vestcl.models._checkpoint import read_trained_on, write_checkpoint
 from vestcl.models.forecaster import Forecaster
+from vestcl.prepare_clip import prepare_clip
 
 KILLED = -9
 
@@ -207,6 +212,51 @@ def test_a_lost_worker_is_a_line(
     monkeypatch.setattr(fit, "fit", lost)
     assert fit.main([str(write_yaml(tmp_path / "run.yaml", cache, tmp_path / "out"))]) == 2
     assert capsys.readouterr().err.startswith(f"error: {words}")
+
+
+# ---------------------------------------------------------------- what it was trained on
+
+
+def test_a_models_file_has_its_training_clips(models: None, whole: Path, tmp_path: Path) -> None:
+    """The first and the last frame that windows showed, in every file and in what is exported."""
+    newest = checkpoint.list_checkpoints(whole)[0]
+    for name in ("model", "ema"):
+        assert read_trained_on(newest / f"{name}.safetensors") == {"street 3": (0, 4)}
+    assert export.main([str(newest), str(tmp_path / "half.safetensors")]) == 0
+    assert read_trained_on(tmp_path / "half.safetensors") == {"street 3": (0, 4)}
+    Forecaster(MODELS["small"]).save(tmp_path / "fresh.safetensors")
+    assert read_trained_on(tmp_path / "fresh.safetensors") is None
+
+
+def test_what_init_was_trained_on_counts(models: None, cache: Path, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model, init = Forecaster(MODELS["small"]), tmp_path / "init.safetensors"
+    write_checkpoint(init, model.config, model.state_dict(), {"elsewhere": (3, 9), "street 3": (2, 8)})
+    assert run(cache, tmp_path / "out", init=str(init), data={"frames": [1, 4]})
+    newest = checkpoint.list_checkpoints(tmp_path / "out")[0]
+    assert read_trained_on(newest / "model.safetensors") == {"elsewhere": (3, 9), "street 3": (1, 8)}
+
+
+def test_files_with_both_records_are_the_same_bytes(tmp_path: Path) -> None:
+    model, contents = Forecaster(MODELS["small"]), set()
+    for _ in range(8):
+        write_checkpoint(tmp_path / "a.safetensors", model.config, model.state_dict(), {"b": (0, 1), "a": (2, 3)})
+        contents.add((tmp_path / "a.safetensors").read_bytes())
+    assert len(contents) == 1
+    assert Forecaster.load(tmp_path / "a.safetensors").config == model.config
+
+
+def test_only_the_drives_of_a_split_are_shown(tmp_path: Path) -> None:
+    """Of a folder that has a training drive and a test drive."""
+    street = Street.generate(3).clip(4, 48, 160, samples=1)
+    for name in (KITTI_VIEWS_TRAIN[0], KITTI_VIEWS_TEST[0]):
+        prepare_clip(dataclasses.replace(street, name=name), tmp_path / name)
+    roots = (str(tmp_path),)
+    for split, drives in (("kitti-views", KITTI_VIEWS_TRAIN[:1]), (None, (KITTI_VIEWS_TRAIN[0], KITTI_VIEWS_TEST[0]))):
+        shown = fit.window_set(DataConfig(train=roots, split=split)).shown
+        assert shown == dict.fromkeys(drives, (0, 3))
+    with pytest.raises(ValueError, match="must have drives that kitti-views trains on, got none in"):
+        fit.window_set(DataConfig(train=(str(tmp_path / KITTI_VIEWS_TEST[0]),), split="kitti-views"))
 
 
 # ---------------------------------------------------------------- the log

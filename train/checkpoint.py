@@ -16,7 +16,6 @@ import json
 import os
 import pickle
 import platform
-import random
 import re
 import secrets
 import shutil
@@ -32,6 +31,8 @@ from safetensors import SafetensorError
 
 import vestcl
 from train.hashes import known_sha256, sha256
+from train.rng import restore_rng as restore_rng
+from train.rng import rng_state
 from vestcl.models._checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models.config import ModelConfig
 
@@ -65,23 +66,6 @@ def package_versions() -> dict[str, str]:
     }  # fmt: skip
 
 
-def rng_state() -> dict[str, Any]:
-    """The global generators of torch, NumPy and Python, in plain containers; `restore_rng` takes them."""
-    state: dict[str, Any] = np.random.get_state(legacy=False)  # noqa: NPY002 - the one that others' code may use
-    key = torch.from_numpy(state["state"]["key"].astype(np.int64))
-    numpy_state = {**state, "state": {**state["state"], "key": key}}
-    return {"torch": torch.get_rng_state(), "numpy": numpy_state, "python": random.getstate()}
-
-
-def restore_rng(state: Mapping[str, Any]) -> None:
-    """Set the generators to what `rng_state` gave."""
-    inner = state["numpy"]["state"]
-    torch.set_rng_state(state["torch"])
-    key = inner["key"].numpy().astype(np.uint32)
-    np.random.set_state({**state["numpy"], "state": {**inner, "key": key}})  # noqa: NPY002
-    random.setstate(state["python"])
-
-
 @dataclass(frozen=True, eq=False)
 class State:
     """All that a run needs to go on as if it had never stopped."""
@@ -102,6 +86,8 @@ class State:
     versions: dict[str, str] = field(default_factory=package_versions)
     extra: dict[str, Any] = field(default_factory=dict)
     """Plain containers, numbers, strings and tensors of the caller's."""
+    trained_on: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """By clip, the first and the last frame that was shown; the models' files have it, too."""
     recent: list[dict[str, float]] = field(default_factory=list)
     """`train.report.Reporter.recent`: the next row of log.jsonl is a mean over these updates, too."""
 
@@ -190,7 +176,7 @@ def _step(path: Path) -> int:
 
 def _packed(state: State) -> bytes:
     """All but the weights, as `torch.save` writes it; read back once, for a checkpoint that can't be read is none."""
-    names = ("step", "config", "optimiser", "scheduler", "rng", "versions", "extra", "recent")
+    names = ("step", "config", "optimiser", "scheduler", "rng", "versions", "extra", "recent", "trained_on")
     file = io.BytesIO()
     torch.save({name: getattr(state, name) for name in names}, file)
     try:
@@ -208,9 +194,9 @@ def _unpacked(file: io.BytesIO) -> dict[str, Any]:
 
 def _write(folder: Path, state: State, rest: bytes) -> None:
     """All files of a checkpoint, on the disk when this returns."""
-    write_checkpoint(folder / _MODEL, state.model_config, state.model)
+    write_checkpoint(folder / _MODEL, state.model_config, state.model, state.trained_on)
     if state.ema is not None:
-        write_checkpoint(folder / _EMA, state.model_config, state.ema)
+        write_checkpoint(folder / _EMA, state.model_config, state.ema, state.trained_on)
     (folder / _STATE).write_bytes(rest)
     files = {file.name: {"bytes": file.stat().st_size, "sha256": known_sha256(file)} for file in
              sorted(folder.iterdir())}  # fmt: skip

@@ -47,8 +47,10 @@ class DataConfig:
     """Probability that the target is the right camera, of samples that have one."""
     frames: tuple[CountOrNone, Count] | None = None
     """(first, last) index of the frames that windows may touch, both included; null is the whole clip."""
+    split: Literal["kitti-prediction", "kitti-views"] | None = None
+    """Show only the drives that this split of KITTI raw trains on (`vestcl.data.splits`); null shows all clips."""
     workers: CountOrNone = 0
-    """Processes that read beside the one that trains."""
+    """Processes that read next to the one that trains."""
 
     def __post_init__(self) -> None:
         if not self.train:

@@ -131,6 +131,15 @@ class WindowSet:
         known = [clip.interval for clip in self.clips if clip.interval is not None]
         return round(float(np.median(known)), 6) if known else None
 
+    @property
+    def shown(self) -> dict[str, tuple[int, int]]:
+        """By clip, the first and the last frame that windows show."""
+        found: dict[str, tuple[int, int]] = {}
+        for number, t in self.windows:
+            first, last = found.get(self.clips[number].name, (t - 1, t))
+            found[self.clips[number].name] = min(first, t - 1), max(last, t + len(self.horizons))
+        return found
+
     def global_batch(self, seed: int, step: int, batch: int) -> list[Draw]:
         """The places of a step's batch, over all ranks.
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import tyro
 
 from train.command import ERRORS, failed
-from vestcl.models._checkpoint import write_checkpoint
-from vestcl.pretrained import load_model
+from vestcl.models._checkpoint import read_trained_on, write_checkpoint
+from vestcl.pretrained import find_model, load_model
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def export(checkpoint: Path, out: Path) -> None:
     state = {name: tensor.half() for name, tensor in model.state_dict().items()}
     if beyond := [name for name, tensor in state.items() if not tensor.isfinite().all()]:
         raise ValueError(f"`checkpoint` must have weights below 65,504 for float16, got more in {', '.join(beyond)}")
-    write_checkpoint(out, model.config, state)
+    write_checkpoint(out, model.config, state, read_trained_on(find_model(checkpoint)))
 
 
 if __name__ == "__main__":

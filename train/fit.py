@@ -30,6 +30,8 @@ from train.ranks import Ranks, lost_processes_named
 from train.report import Reporter
 from train.trainer import Average, NotANumberError, Trainer, build_model
 from vestcl import runtime
+from vestcl.data.splits import KITTI_TRAINING
+from vestcl.models._checkpoint import Frames, read_trained_on
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepared import find_prepared
 
@@ -142,6 +144,8 @@ class _Run:
         self.config, self.ranks, self.stop = config, ranks, stop
         self.model: Forecaster = build_model(config)
         self.average = Average(self.model, config.optimiser.ema) if config.optimiser.ema else None
+        #: What the weights were shown, those of ``init`` included as far as their file says.
+        self.trained_on = (read_trained_on(config.init) if config.init else None) or {}
         self.perceptual = {loss: build_perceptual(loss) for loss in map(config.loss_of, config.stages)}
         self.step = 0
 
@@ -172,6 +176,7 @@ class _Run:
         windows = window_set(self.config.data_of(stage))
         learned = windows.interval or self.model.config.interval_s
         self.model.config = dataclasses.replace(self.model.config, interval_s=learned)
+        self.trained_on = merged(self.trained_on, windows.shown)
         steps = range(done, stage.steps)
         batches = loader(
             windows, self.config.seed + number, stage.batch, steps, rank=self.ranks.rank, world=self.ranks.world,
@@ -205,7 +210,7 @@ class _Run:
         count = self.average.count if self.average else 0
         state = State(
             self.step, to_dict(self.config), self.model.config, self.model.state_dict(), ema, adam, schedule,
-            extra={"averaged": count}, recent=self.report.recent,
+            extra={"averaged": count}, recent=self.report.recent, trained_on=self.trained_on,
         )  # fmt: skip
         try:
             checkpoint.save(self.config.out, state, self.config.run.keep)
@@ -215,7 +220,7 @@ class _Run:
             self.report.say(f"step {self.step}: {error}", "red")
 
     def _restore(self, state: State) -> None:
-        self.step = state.step
+        self.step, self.trained_on = state.step, merged(self.trained_on, state.trained_on)
         self.model.load_state_dict(dict(state.model))
         if self.average and state.ema is not None:
             self.average.restore(dict(state.ema), state.extra["averaged"])
@@ -239,13 +244,27 @@ class _Run:
         )
 
 
+def merged(frames: Frames, others: Frames) -> dict[str, tuple[int, int]]:
+    """By clip, from the first of both to the last of both."""
+    both = {**others, **frames}
+    for name in frames.keys() & others.keys():
+        first, last = zip(frames[name], others[name], strict=True)
+        both[name] = min(first), max(last)
+    return both
+
+
 def window_set(data: DataConfig) -> WindowSet:
     """The windows that a configuration's data hold.
 
     Raises:
-        ValueError: no prepared clip there, or none long enough.
+        ValueError: no prepared clip there, none of the split, or none long enough.
     """
     clips = [clip for root in data.train for clip in find_prepared(root)]
+    if data.split is not None:
+        drives = KITTI_TRAINING[data.split]
+        clips = [clip for clip in clips if clip.name in drives]
+        if not clips:
+            raise ValueError(f"`data.train` must have drives that {data.split} trains on, got none in {data.train}")
     return WindowSet(
         clips, horizons=data.horizons, crop=data.crop, flip=data.flip, colour=data.colour, right=data.right,
         frames=data.frames, scale=data.scale,

@@ -1,4 +1,4 @@
-"""A model in one file: weights in safetensors, and in its metadata the whole configuration as JSON."""
+"""A model in one file: weights in safetensors; in its metadata, as JSON, its configuration and training clips."""
 
 import dataclasses
 import json
@@ -16,21 +16,66 @@ from vestcl.io import atomic
 from vestcl.models._weights import check_finite, unwrapped
 from vestcl.models.config import ModelConfig
 
-#: The metadata's entry that holds the configuration.
+#: The metadata's entry that holds the configuration, and the one that holds the clips that the model was trained on.
 KEY: Final = "vestcl.config"
+TRAINED_ON: Final = "vestcl.trained_on"
+
+#: Bytes of the header's length at a safetensors file's start, and what the header is padded to.
+_LENGTH: Final = 8
+
+Frames = Mapping[str, tuple[int, int]]
+"""By clip, the first and the last frame."""
 
 
-def write_checkpoint(path: Path | str, config: ModelConfig, state: Mapping[str, torch.Tensor]) -> None:
-    """Write both to ``path``, which is the old file or the new one, never half of it.
+def write_checkpoint(
+    path: Path | str, config: ModelConfig, state: Mapping[str, torch.Tensor], trained_on: Frames | None = None
+) -> None:
+    """Write all to ``path``, which is the old file or the new one, never half of it; the same bytes each time.
 
     The file has the umask's rights; safetensors' own writer leaves it to its owner only.
+
+    Args:
+        path: the file.
+        config: of the model.
+        state: its weights.
+        trained_on: the frames that training has shown it; None where that is not known.
 
     Raises:
         ValueError: the folder can't be made.
         OSError: the file can't be written.
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
-    atomic.write_bytes(path, save(tensors, metadata={KEY: json.dumps(dataclasses.asdict(config))}))
+    metadata = {KEY: json.dumps(dataclasses.asdict(config))}
+    if trained_on is not None:
+        metadata[TRAINED_ON] = json.dumps(trained_on, sort_keys=True)
+    atomic.write_bytes(path, _in_order(save(tensors, metadata=metadata)))
+
+
+def read_trained_on(path: Path | str) -> dict[str, tuple[int, int]] | None:
+    """By clip, the first and the last frame that training has shown the model; None where its file has no record.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: damaged, or no safetensors file.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no model at {path}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            text = (file.metadata() or {}).get(TRAINED_ON)
+        return None if text is None else {name: (int(a), int(b)) for name, (a, b) in json.loads(text).items()}
+    except (SafetensorError, ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"`path` must be a safetensors file of a model, got {path} ({error})") from error
+
+
+def _in_order(content: bytes) -> bytes:
+    """A safetensors file with its metadata sorted: they come in another order each time."""
+    end = _LENGTH + int.from_bytes(content[:_LENGTH], "little")
+    header = json.loads(content[_LENGTH:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % _LENGTH)
+    return b"".join((len(text).to_bytes(_LENGTH, "little"), text, memoryview(content)[end:]))
 
 
 def read_checkpoint(path: Path | str) -> tuple[ModelConfig, dict[str, torch.Tensor]]:
