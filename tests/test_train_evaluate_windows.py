@@ -8,7 +8,8 @@ import pytest
 import torch
 from forecaster_scenes import TINY, stir
 
-from train.evaluate_windows import CAMERA, Setup, forecast, known_of, prepared, presenters, views_of, window
+from train.evaluate_inputs import PAIR, known_of
+from train.evaluate_windows import CAMERA, Setup, forecast, perceptions_of, prepared, presenters, views_of, window
 from train.protocols import NOW, PROTOCOLS
 from vestcl import metrics
 from vestcl.data import Street
@@ -107,13 +108,18 @@ def test_clips_as_they_are_evaluated() -> None:
     half = prepared(clip, setup(size=(24, 80)))
     assert (half[0].height, half[0].width) == (24, 80) and half[0].depth is not None
     np.testing.assert_allclose(half[0].K[:2], clip[0].K[:2] / 2)
-    pairs = prepared(clip, setup(stereo=True))
+    assert list(perceptions_of(clip, setup(stereo=True))) == ["", PAIR]
+    pairs = perceptions_of(clip, setup(stereo=True))[PAIR].clip
     assert pairs[0].depth is None and pairs[0].world_from_cam is not None
     assert known_of(clip) == "Depth is from the street itself, true, masks are from labels."
-    assert known_of(pairs) == "Depth is from the stereo pair at t-1 and t, masks are from labels."
+    assert known_of(pairs, ("pair",)) == (
+        'Depth is from the stereo pair at t-1 and t (rows ending in "stereo pair"), masks are from labels.'
+    )
     blind = [dataclasses.replace(s, depth=None, right=None, labels=None if i else s.labels) for i, s in enumerate(clip)]
     mono = dataclasses.replace(clip, samples=tuple(blind))
-    assert known_of(mono) == "Depth is from motion, masks are from labels where there are any, else motion."
+    assert (
+        known_of(mono, ("motion",)) == "Depth is from motion, masks are from labels where there are any, else motion."
+    )
 
 
 def test_views_that_a_clip_has() -> None:

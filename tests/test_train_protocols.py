@@ -10,7 +10,7 @@ from data_files import picture, write_text
 from train.evaluate_windows import PART_WINDOWS, Part, plan
 from train.protocols import HELD_OUT, NOW, PROTOCOLS, Name, Where, currents
 from vestcl.bench.forecast import HELD_OUT as BENCH_HELD_OUT
-from vestcl.data.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, windows
+from vestcl.data.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL, windows
 from vestcl.io import write_pixels
 from vestcl.scoring import METRICS
 
@@ -138,6 +138,23 @@ def test_streets_are_held_out() -> None:
     assert [part.source.name for part in parts] == [f"street {seed}" for seed in HELD_OUT]
     assert {part.indices for part in parts} == {(2,)} and count(parts) == len(HELD_OUT)
     assert not set(HELD_OUT) & set(BENCH_HELD_OUT)
+
+
+def test_the_papers_ssim_has_several_scales() -> None:
+    """But for the right camera's image at t, where it follows VEST-MPI."""
+    for protocol in PROTOCOLS.values():
+        for row in protocol.paper:
+            assert row.metric in ("lpips", "ssim" if row.view == NOW else "ms_ssim")
+    rows = {row.method[:12]: row.values for row in PROTOCOLS["kitti-space-time"].paper if row.metric == "ms_ssim"}
+    assert [rows[name][1] for name in ("the paper", "the paper, B", "the paper, C", "the paper, A")] == [
+        0.862, 0.856, 0.846, 0.832,
+    ]  # fmt: skip
+
+
+def test_validation_drives_of_novel_views(tmp_path: Path) -> None:
+    frames = {"0009": 9, "0017": 9, "0048": 9, "0117": 9}
+    parts = parts_of("kitti-space-val", empty_drives(tmp_path, frames))
+    assert {part.source.name for part in parts} == set(KITTI_VIEWS_VAL) and not PROTOCOLS["kitti-space-val"].paper
 
 
 def test_the_papers_rows_are_of_what_is_measured() -> None:

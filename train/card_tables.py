@@ -13,6 +13,7 @@ import torch
 
 from train.card_pictures import PARTS, Rows, stages_of
 from train.config import Config, DataConfig, LossConfig
+from train.evaluate_inputs import label_of, plain
 from train.fit import window_set
 from vestcl.data import Street
 from vestcl.models.config import ModelConfig
@@ -257,7 +258,7 @@ def result_tables(told: dict[str, Any], model: str, name: str, horizons: Sequenc
     rivals = set(told["models"]) - {model}
     made = [" ".join([f"{_scope(told)}.", *told.get("notes", ())])]
     for view, methods in told["intervals"].items():
-        shown = {method: found for method, found in methods.items() if method not in rivals}
+        shown = {method: found for method, found in methods.items() if plain(method) not in rivals}
         metrics = [metric for metric in METRICS if metric in next(iter(shown.values()))]
         difference = told["differences"].get(view, {}).get(model, {})
         rows = [
@@ -267,7 +268,7 @@ def result_tables(told: dict[str, Any], model: str, name: str, horizons: Sequenc
         ]
         baseline = GEOMETRIC if GEOMETRIC in shown else next(iter(shown))
         last = (f"{name} less {baseline}, better in",) * bool(difference)
-        heading = ("", *(name if method == model else method for method in shown), *last)
+        heading = ("", *(name + label_of(method) if plain(method) == model else method for method in shown), *last)
         notes = tuple(METRICS[metric].note for metric in metrics if METRICS[metric].note)
         made.append(to_markdown(Grid(f"View {view}", heading, tuple(rows), notes)).rstrip())
     return made

@@ -26,9 +26,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from train import evaluate_report as report
 from train.command import ERRORS, failed
+from train.evaluate_inputs import check_stereo, depths, known_of, plain
+from train.evaluate_leaks import training_overlap
 from train.evaluate_sheets import write_sheets
-from train.evaluate_windows import PART_WINDOWS, Part, Setup, known_of, plan, prepared, read_part, run_part
-from train.protocols import HELD_OUT, PROTOCOLS, Name, Protocol, Source, Where
+from train.evaluate_windows import PART_WINDOWS, Part, Setup, plan, prepared, read_part, run_part
+from train.protocols import HELD_OUT, NOW_NOTE, PROTOCOLS, Name, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
 from vestcl import __version__, runtime
 from vestcl.bench import _results
@@ -45,6 +47,9 @@ WIDTH: Final = 200
 
 #: Settings that scores do not depend on, or that stand in the key as the content of files.
 _NOT_IN_KEY: Final = ("model", "squeeze", "lpips", "out", "shard", "merge", "device", "horizons", "sheets")
+
+#: Of the scores' files: raised when what a window is given or how it is scored changes.
+_SCORING: Final = 2
 
 #: What of a protocol its published figures depend on.
 _PUBLISHED: Final = ("size", "steps", "first", "last")
@@ -83,7 +88,8 @@ class Evaluation:
     mode: Mode = "compose"
     """How models make steps after the first: compose the first motion, or feed each forecast frame back."""
     stereo: bool = False
-    """Take depth from stereo pairs even where clips have depth (laser scans, or a street's true depth)."""
+    """Take depth from stereo pairs even where clips have depth (laser scans, or a street's true depth). Rows that do
+    end in "stereo pair"; where the right camera's future is judged they come next to monocular ones."""
     seeds: tuple[int, int] = (HELD_OUT[0], HELD_OUT[-1])
     """Of streets: the first and the last."""
     samples: int = 2
@@ -138,8 +144,10 @@ def evaluate(config: Evaluation) -> None:
                 raise ValueError(f"`merge` needs all of them: {state}")
             console.print(f"{state}; the process that does the last makes the tables", highlight=False, soft_wrap=True)
             return
-        notes = (known_of(prepared(sources[0].opens(), setup)), *_caveats(config, setup))
-        results = report.Results(protocol, records, protocol.shown, tuple(setup.models), notes)
+        first = prepared(sources[0].opens(), setup)
+        notes = (known_of(first, depths(first, protocol, config.stereo)), *_caveats(config, setup))
+        leaks, unknown = training_overlap(config.model, parts, setup.steps)
+        results = report.Results(protocol, records, protocol.shown, tuple(setup.models), notes + unknown, leaks)
         _write(out, results, about | {"machine": _results.describe(session)}, console)
         if config.sheets:
             _sheets(out, sources, setup, results, console)
@@ -158,17 +166,18 @@ def protocol_of(config: Evaluation) -> Protocol:
         value = getattr(config, name)
         if value is not None and value < 1:
             raise ValueError(f"`{name}` must be 1 or more, got {value}")
-    plain = PROTOCOLS[config.protocol]
-    steps = config.steps or plain.steps
-    shown = config.horizons or tuple(k for k in plain.shown if k <= steps) or (steps,)
+    default = PROTOCOLS[config.protocol]
+    check_stereo(default, config.stereo)
+    steps = config.steps or default.steps
+    shown = config.horizons or tuple(k for k in default.shown if k <= steps) or (steps,)
     if not all(1 <= k <= steps for k in shown):
         raise ValueError(f"`horizons` must be steps, 1 ... {steps}, got {shown}")
-    size = config.height or plain.size[0], config.width or plain.size[1]
-    first = plain.first if config.first is None else config.first
+    size = config.height or default.size[0], config.width or default.size[1]
+    first = default.first if config.first is None else config.first
     last = config.last
-    if last is None and plain.last is not None:
-        last = max(plain.last, first or 0)
-    return dataclasses.replace(plain, size=size, steps=steps, shown=tuple(sorted(shown)), first=first, last=last)
+    if last is None and default.last is not None:
+        last = max(default.last, first or 0)
+    return dataclasses.replace(default, size=size, steps=steps, shown=tuple(sorted(shown)), first=first, last=last)
 
 
 def setup_of(config: Evaluation, protocol: Protocol) -> Setup:
@@ -211,7 +220,9 @@ def _about(config: Evaluation, protocol: Protocol) -> dict[str, Any]:
 
 def _key(about: dict[str, Any]) -> str:
     hashes = {name: model["sha256"] for name, model in about["models"].items()}
-    content = json.dumps(about | {"models": hashes, "part": PART_WINDOWS}, sort_keys=True, default=str)
+    content = json.dumps(
+        about | {"models": hashes, "part": PART_WINDOWS, "scoring": _SCORING}, sort_keys=True, default=str
+    )
     return hashlib.sha256(content.encode()).hexdigest()[:12]
 
 
@@ -227,13 +238,13 @@ def _caveats(config: Evaluation, setup: Setup) -> list[str]:
         told.append(f"Without weights, not measured: {', '.join(absent)}.")
     if min(setup.size) < MS_SSIM_SIDE:
         told.append(f"MS-SSIM needs {MS_SSIM_SIDE} pixels a side, got {setup.size[0]} x {setup.size[1]}.")
-    plain = PROTOCOLS[config.protocol]
+    default = PROTOCOLS[config.protocol]
     changed = [f"{name} {getattr(protocol, name)}" for name in _PUBLISHED
-               if getattr(protocol, name) != getattr(plain, name)]  # fmt: skip
+               if getattr(protocol, name) != getattr(default, name)]  # fmt: skip
     changed += [f"every {config.every}"] if config.every > 1 else []
-    if plain.paper and changed:
+    if default.paper and changed:
         told.append(f"Not the published protocol: {', '.join(changed)}.")
-    return told
+    return told + [NOW_NOTE] * protocol.now
 
 
 # ---------------------------------------------------------------- work and results
@@ -272,9 +283,9 @@ def _write(out: Path, results: report.Results, about: dict[str, Any], console: C
 
 
 def _sheets(out: Path, sources: Sequence[Source], setup: Setup, results: report.Results, console: Console) -> None:
-    judged = next(iter(setup.models), GEOMETRIC)
-    view = next(r.view for r in results.records if r.method == judged and "psnr" in r.scores)
-    own: list[Record] = [r for r in results.records if (r.view, r.method) == (view, judged)]
+    wanted = next(iter(setup.models), GEOMETRIC)
+    judged = next(r for r in results.records if plain(r.method) == wanted and "psnr" in r.scores)
+    own: list[Record] = [r for r in results.records if (r.view, r.method) == (judged.view, judged.method)]
     for path in write_sheets(out, sources, setup, own, report.headline(own)[0], results.horizons):
         console.print(f"wrote {path}", soft_wrap=True, highlight=False)
 

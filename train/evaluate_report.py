@@ -2,10 +2,11 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
+from train.evaluate_inputs import label_of, plain
 from train.evaluate_statistics import Difference, Interval, differences, intervals, unit
 from train.evaluate_windows import CONSTANT_VELOCITY
 from train.protocols import PAPER_NOTE, Protocol
@@ -29,6 +30,9 @@ from vestcl.scoring import (
 #: What models are held against: the forecast without weights and, for the camera's motion, where that takes it from.
 _BASELINES: Final = (GEOMETRIC, CONSTANT_VELOCITY)
 
+#: What ends the title of the paper's table.
+_PAPER: Final = ", the paper"
+
 #: Clips of a table a clip; more go to results.json alone.
 CLIP_ROWS: Final = 60
 
@@ -46,14 +50,19 @@ class Results:
     horizons: tuple[int, ...]
     """That tables show."""
     models: tuple[str, ...]
-    """As methods are called."""
+    """As methods are called, without labels."""
     told: tuple[str, ...] = ()
     """What was given to methods and what was not measured, a sentence each."""
+    leaks: tuple[str, ...] = ()
+    """Which models were trained on what is evaluated, a sentence each: notes of every table."""
 
-    @property
-    def compared(self) -> tuple[str, ...]:
-        """The methods that narrow tables show."""
-        return (GEOMETRIC, *self.models)
+    def is_model(self, method: str) -> bool:
+        """Whether a row is a model's, with whatever label."""
+        return plain(method) in self.models
+
+    def is_compared(self, method: str) -> bool:
+        """Whether narrow tables show a row."""
+        return self.is_model(method) or plain(method) in _BASELINES
 
 
 def headline(records: Sequence[Record]) -> list[str]:
@@ -71,19 +80,27 @@ def grids(results: Results) -> list[Grid]:
     """All tables: by horizon, differences, the paper's, running means, intervals, by clip."""
     name, records, horizons = results.protocol.title, results.records, results.horizons
     pictures = [record for record in records if record.first == 1 and "psnr" in record.scores]
-    return [
+    made = [
         *short_grids(results),
         *picture_grids(name, pictures, [k for k in horizons if k > 1], running=True),
         *(_interval_grid(view, of_view, results) for view, of_view in by_view(records).items()),
         *_clip_grids(results),
     ]
+    return [_with_leaks(grid, results) for grid in made]
 
 
 def short_grids(results: Results) -> list[Grid]:
     """Those that a terminal has room for: by horizon, differences, the paper's."""
     name = results.protocol.title
     shown = picture_grids(name, results.records, results.horizons)
-    return [*shown, *_difference_grids(results), *_paper_grids(results)]
+    return [_with_leaks(grid, results) for grid in (*shown, *_difference_grids(results))] + _paper_grids(results)
+
+
+def _with_leaks(grid: Grid, results: Results) -> Grid:
+    """The table with the sentences on models that were trained on what is evaluated, once."""
+    is_paper = grid.title.endswith(_PAPER)
+    missing = () if is_paper else tuple(leak for leak in results.leaks if leak not in grid.notes)
+    return replace(grid, notes=(*grid.notes, *missing))
 
 
 def _interval_grid(view: str, records: Sequence[Record], results: Results) -> Grid:
@@ -101,14 +118,14 @@ def _difference_grids(results: Results) -> list[Grid]:
     made = []
     for view, of_view in by_view(results.records).items():
         methods = {method: own for (_, method), own in by_method(of_view).items()}
-        baseline = next((name for name in methods if name in _BASELINES), None)
-        steps, rows = steps_of(of_view, results.horizons), list[tuple[str, ...]]()
-        for model in (name for name in results.models if name in methods and baseline):
-            for metric, found in differences(methods[model], methods[str(baseline)]).items():
+        steps, of_baseline = steps_of(of_view, results.horizons), dict[str, list[tuple[str, ...]]]()
+        for model in filter(results.is_model, methods):
+            baseline = _baseline(model, methods)
+            for metric, found in differences(methods[model], methods[baseline]).items() if baseline else ():
                 shown = [found[k - of_view[0].first] for k in steps]
                 cells = (f"{_cell(d.interval, '+' + METRICS[metric].digits)}, {d.better:.0%}" for d in shown)
-                rows.append((f"{model}, {METRICS[metric].label}", *cells))
-        if rows:
+                of_baseline.setdefault(str(baseline), []).append((f"{model}, {METRICS[metric].label}", *cells))
+        for baseline, rows in of_baseline.items():
             title = f"{results.protocol.title}, view {view}, model less {baseline}"
             notes = ("Each: mean difference, its 95 % interval, share of windows where the model is better.",)
             heading = ("", *map(horizon, steps))
@@ -116,12 +133,17 @@ def _difference_grids(results: Results) -> list[Grid]:
     return made
 
 
+def _baseline(method: str, methods: Collection[str]) -> str | None:
+    """The row with the same label that a model is held against, if there is one."""
+    return next((name for name in (base + label_of(method) for base in _BASELINES) if name in methods), None)
+
+
 def _clip_grids(results: Results) -> list[Grid]:
     """A row a clip."""
     made = []
     for view, of_view in by_view(results.records).items():
         clips = list(dict.fromkeys(record.clip for record in of_view))
-        own = [record for record in of_view if record.method in (*results.compared, *_BASELINES)]
+        own = [record for record in of_view if results.is_compared(record.method)]
         if not 1 < len(clips) <= CLIP_ROWS or not own:
             continue
         methods, metrics = list(dict.fromkeys(record.method for record in own)), headline(own)
@@ -154,7 +176,7 @@ def _paper_grids(results: Results) -> list[Grid]:
         cells = (f"{values[m, k]:.3f}" if (m, k) in values else "-" for m in metrics for k in steps)
         lines.append((f"{method}, view {view}", *cells))
     heading = ("", *(f"{METRICS[m].label} {horizon(k)}" for m in metrics for k in steps))
-    return [Grid(f"{results.protocol.title}, the paper", heading, tuple(lines), (PAPER_NOTE,))]
+    return [Grid(results.protocol.title + _PAPER, heading, tuple(lines), (PAPER_NOTE,))]
 
 
 def _cell(interval: Interval, digits: str) -> str:
@@ -180,7 +202,7 @@ def markdown(results: Results, about: Sequence[str]) -> str:
         results: all windows.
         about: lines on models, device and settings.
     """
-    head = [f"# {results.protocol.title}", "", *(f"- {line}" for line in (*about, *results.told)), ""]
+    head = [f"# {results.protocol.title}", "", *(f"- {line}" for line in (*about, *results.told, *results.leaks)), ""]
     return "\n".join([*head, *map(to_markdown, grids(results))])
 
 
@@ -210,7 +232,7 @@ def as_json(results: Results, about: Mapping[str, Any]) -> dict[str, Any]:
     told: dict[str, Any] = {
         **about,
         "title": results.protocol.title,
-        "notes": results.told,
+        "notes": [*results.told, *results.leaks],
         "summary": summarise(results.records),
         "intervals": _nested({key: _plain(intervals(own)) for key, own in groups.items()}),
         "differences": _nested({key: _plain(found) for key, found in _all_differences(results).items()}),
@@ -227,9 +249,9 @@ def _all_differences(results: Results) -> dict[tuple[str, str], dict[str, list[D
     groups = by_method(results.records)
     found = {}
     for (view, method), own in groups.items():
-        for baseline in _BASELINES:
-            if method in results.models and (view, baseline) in groups:
-                found[view, method] = differences(own, groups[view, baseline])
+        baseline = _baseline(method, [name for of, name in groups if of == view])
+        if results.is_model(method) and baseline:
+            found[view, method] = differences(own, groups[view, baseline])
     return found
 
 

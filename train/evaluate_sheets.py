@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from train.evaluate_inputs import label_of, plain
 from train.evaluate_statistics import extremes
-from train.evaluate_windows import Setup, forecast, prepared, views_of
+from train.evaluate_windows import Setup, forecast, perceptions_of, prepared, views_of
 from train.protocols import Source
 from vestcl import sheet
-from vestcl.geometric import Perception
 from vestcl.io.images import write_pixels
 from vestcl.scoring import GEOMETRIC, METRICS, Record, Truth
 from vestcl.sheet import Cell, Picture
@@ -69,8 +69,8 @@ def window_sheet(source: Source, setup: Setup, record: Record, shown: Sequence[i
     """
     clip = prepared(source.opens(), setup)
     truth, view = Truth(clip, setup.size), next(v for v in views_of(clip, setup) if v.name == record.view)
-    made = forecast(Perception(clip), record.index, [view], setup)
-    methods = list(dict.fromkeys((GEOMETRIC, record.method)))
+    made = forecast(perceptions_of(clip, setup)[label_of(record.method)], record.index, [view], setup)
+    methods = list(dict.fromkeys((GEOMETRIC, plain(record.method))))
     rows = []
     for step in shown:
         wanted = truth.full(view, record.index + step)

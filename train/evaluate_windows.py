@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeVar
 
-from train.protocols import NOW, Protocol, Source, currents
+from train.evaluate_inputs import depths, given, label, label_of, plain
+from train.protocols import NOW, NOW_BORDER, Protocol, Source, currents
 from vestcl import network
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
@@ -29,7 +30,6 @@ from vestcl.scoring import (
     OTHER_CAMERA,
     RIGHT,
     SOURCE,
-    Forecasts,
     Prediction,
     Record,
     Timed,
@@ -53,13 +53,6 @@ Made = TypeVar("Made")
 Presenter = Callable[[Perception, int, Sequence[View]], dict[str, Rendered]]
 """(perception, t, cameras) -> frame t by the cameras' names."""
 
-#: Where depth comes from, by its reader.
-_DEPTHS: Final = {
-    "VelodyneScan": "laser scans, densified",
-    "StreetDepth": "the street itself, true",
-    "DisparityFile": "disparity files",
-}
-
 #: Baseline of the right camera's present: what the source camera sees.
 AS_SEEN: Final = f"unchanged{OTHER_CAMERA}"
 
@@ -76,7 +69,7 @@ class Setup:
     """By the name that tables give them."""
     mode: Mode = "compose"
     stereo: bool = False
-    """Depth from the stereo pair although the clip has depth."""
+    """Depth from the stereo pair although the clip has depth, see `train.evaluate_inputs.depths`."""
     trunk: Trunk | None = None
     """SqueezeNet 1.0."""
     lpips: Lpips | None = None
@@ -138,12 +131,12 @@ def run_part(part: Part, setup: Setup, advance: Callable[[], None] = lambda: Non
         ValueError: as the readers and forecasts.
     """
     clip = prepared(part.source.opens(), setup)
-    perception = Perception(clip)
+    perceptions = perceptions_of(clip, setup)
     truth = Truth(clip, setup.size, setup.trunk, setup.lpips)
     records: list[Record] = []
     for index in part.indices:
         truth.forget(index - 1)
-        records += window(perception, truth, index, setup)
+        records += window(perceptions, truth, index, setup)
         advance()
     content = {"windows": len(part.indices), "records": [dataclasses.asdict(record) for record in records]}
     write_bytes(part.file, json.dumps(content).encode())
@@ -159,17 +152,23 @@ def read_part(part: Part) -> list[Record] | None:
         return None
     try:
         return [Record(**record) for record in json.loads(read_bytes(part.file))["records"]]
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise ValueError(f"{part.file}: holds no scores ({error}); delete it to have them made anew") from error
 
 
 def prepared(clip: Clip, setup: Setup) -> Clip:
-    """The clip at the size that is evaluated; with ``stereo`` without depth of its own."""
-    resized = clip.resized(*setup.size)
-    if not setup.stereo:
-        return resized
-    bare = tuple(dataclasses.replace(sample, depth=None) for sample in resized)
-    return dataclasses.replace(resized, samples=bare)
+    """The clip at the size that is evaluated."""
+    return clip.resized(*setup.size)
+
+
+def perceptions_of(clip: Clip, setup: Setup) -> dict[str, Perception]:
+    """By the label of their rows, what forecasts see of the clip with each source of depth.
+
+    Args:
+        clip: as `prepared` gives it.
+        setup: its protocol, and whether stereo pairs are asked for.
+    """
+    return {label(depth): Perception(given(clip, depth)) for depth in depths(clip, setup.protocol, setup.stereo)}
 
 
 def views_of(clip: Clip, setup: Setup) -> list[View]:
@@ -184,32 +183,14 @@ def views_of(clip: Clip, setup: Setup) -> list[View]:
     return parse_views(there, clip)
 
 
-def known_of(clip: Clip) -> str:
-    """A sentence on what all methods but the baselines are given beside frames t-1 and t.
-
-    Args:
-        clip: as `prepared` gives it.
-    """
-    sample = clip[0]
-    if sample.depth is not None:
-        depth = _DEPTHS.get(type(sample.depth).__name__, "files")
-    else:
-        depth = "motion" if sample.right is None else "the stereo pair at t-1 and t"
-    labelled = sum(sample.labels is not None for sample in clip)
-    masks = (
-        "motion" if not labelled else "labels" if labelled == len(clip) else "labels where there are any, else motion"
-    )
-    return f"Depth is from {depth}, masks are from {masks}."
-
-
 # ---------------------------------------------------------------- a window
 
 
-def window(perception: Perception, truth: Truth, index: int, setup: Setup) -> list[Record]:
+def window(perceptions: Perception | Mapping[str, Perception], truth: Truth, index: int, setup: Setup) -> list[Record]:
     """Every method's scores on one window.
 
     Args:
-        perception: of the truth's clip.
+        perceptions: of the truth's clip, by the label of their rows (`perceptions_of`); one alone has no label.
         truth: of the clip as `prepared` gives it.
         index: the current frame t.
         setup: methods, views and steps.
@@ -217,23 +198,27 @@ def window(perception: Perception, truth: Truth, index: int, setup: Setup) -> li
     Returns:
         A record a view and method, and of `CAMERA` where the clip has poses.
     """
-    clip = truth.clip
+    clip, by_label = truth.clip, {"": perceptions} if isinstance(perceptions, Perception) else perceptions
     views = views_of(clip, setup)
-    forecasts = forecast(perception, index, views, setup)
+    forecasts = {
+        name + ending: made
+        for ending, perception in by_label.items()
+        for name, made in forecast(perception, index, views, setup).items()
+    }
     shown = predictions(truth, index, setup.steps, views, forecasts)
-    records = score(truth, index, views, shown, forecasts[GEOMETRIC].forecast)
+    records = score(truth, index, views, shown, next(iter(forecasts.values())).forecast)
     if setup.protocol.now:
-        records += _now(perception, truth, index, setup)
+        records += _now(next(iter(by_label.values())), truth, index, setup)
     motion = true_motion(clip, index, setup.steps)
     if motion is not None:
         for name, made in forecasts.items():
-            method = CONSTANT_VELOCITY if name == GEOMETRIC else name
+            method = CONSTANT_VELOCITY + label_of(name) if plain(name) == GEOMETRIC else name
             errors = ego_errors(made.forecast, motion)
             records.append(Record(clip.name, clip[index].name, index, CAMERA, method, math.nan, errors))
     return records
 
 
-def forecast(perception: Perception, index: int, views: Sequence[View], setup: Setup) -> Forecasts:
+def forecast(perception: Perception, index: int, views: Sequence[View], setup: Setup) -> dict[str, Timed]:
     """The geometric forecast, then each model's. All use what the first has seen, and are charged for it.
 
     Args:
@@ -242,12 +227,12 @@ def forecast(perception: Perception, index: int, views: Sequence[View], setup: S
         views: cameras.
         setup: models, mode and steps.
     """
-    plain, whole = _timed(lambda: forecast_frames(perception, index, setup.steps, views))
-    looking = max(whole - plain.seconds["render"], 0.0)
-    made = {GEOMETRIC: Timed(plain, whole)}
+    plain_made, whole = _timed(lambda: forecast_frames(perception, index, setup.steps, views))
+    looking = max(whole - plain_made.seconds["render"], 0.0)
+    made = {GEOMETRIC: Timed(plain_made, whole)}
     for name, model in setup.models.items():
-        given = (perception, model, index, setup.steps, views)
-        own, seconds = _timed(functools.partial(network.forecast_frames, *given, mode=setup.mode))
+        seen = (perception, model, index, setup.steps, views)
+        own, seconds = _timed(functools.partial(network.forecast_frames, *seen, mode=setup.mode))
         made[name] = Timed(own, looking + seconds)
     return made
 
@@ -269,8 +254,9 @@ def _network_shows(model: Forecaster, perception: Perception, index: int, views:
 
 
 def _now(perception: Perception, truth: Truth, index: int, setup: Setup) -> list[Record]:
-    """The right camera's picture at t, by who can show it, and beside it what the source camera sees."""
+    """The right camera's image at t, by who can show it, and what the source camera sees; scored as VEST-MPI does."""
     clip = truth.clip
+    truth = Truth(clip, truth.size, truth.trunk, truth.lpips, NOW_BORDER)
     view = dataclasses.replace(parse_view(RIGHT, clip), name=NOW)
     methods = {AS_SEEN: Prediction([truth.full(parse_view(SOURCE, clip), index)], 0.0)}
     made = {name: _timed(functools.partial(by, perception, index, [view])) for name, by in presenters(setup).items()}

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.nn import functional
 
 from vestcl import baselines, metrics
 from vestcl.compare import FLOW, REPEAT
@@ -16,6 +17,7 @@ from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, View
 from vestcl.models.trunks import Trunk
 from vestcl.perceptual import Lpips, _squared_difference
+from vestcl.scoring.border import blacken_border
 from vestcl.views import seen_by
 
 #: The forecast without weights, as tables and files call it.
@@ -97,12 +99,15 @@ class Truth:
         size: (height, width) that is scored, px.
         trunk: SqueezeNet 1.0, or None.
         lpips: or None.
+        border: share of each side's outer pixels that are scored as black, in the truth and in what is held against
+            it (`vestcl.scoring.border.blacken_border`); SSIM's windows then reach beyond the image, as in VEST-MPI.
     """
 
     def __init__(
-        self, clip: Clip, size: tuple[int, int], trunk: Trunk | None = None, lpips: Lpips | None = None
-    ) -> None:
-        self.clip, self.size, self.trunk, self.lpips = clip, size, trunk, lpips
+        self, clip: Clip, size: tuple[int, int], trunk: Trunk | None = None, lpips: Lpips | None = None,
+        border: float = 0.0,
+    ) -> None:  # fmt: skip
+        self.clip, self.size, self.trunk, self.lpips, self.border = clip, size, trunk, lpips, border
         self._full: dict[tuple[str, int], NDArray[np.float32]] = {}
         self._looks: dict[tuple[str, int], Look] = {}
 
@@ -124,7 +129,7 @@ class Truth:
         """The same as it is scored."""
         key = view.name, index
         if key not in self._looks:
-            self._looks[key] = look([self.full(view, index)], self.size, self.trunk, self.lpips)[0]
+            self._looks[key] = look([self.full(view, index)], self.size, self.trunk, self.lpips, self.border)[0]
         return self._looks[key]
 
     def forget(self, index: int) -> None:
@@ -135,8 +140,9 @@ class Truth:
 
 
 def look(
-    pictures: Pictures, size: tuple[int, int], trunk: Trunk | None = None, lpips: Lpips | None = None
-) -> list[Look]:
+    pictures: Pictures, size: tuple[int, int], trunk: Trunk | None = None, lpips: Lpips | None = None,
+    border: float = 0.0,
+) -> list[Look]:  # fmt: skip
     """Resize, quantise, and take the trunks' maps of all pictures in one go.
 
     Args:
@@ -144,12 +150,15 @@ def look(
         size: (height, width) px.
         trunk: SqueezeNet 1.0, or None.
         lpips: or None.
+        border: as `Truth` has it.
 
     Raises:
         ValueError: pictures too small for a trunk.
     """
     resized = np.stack([resize_image(picture, *size) for picture in pictures])
     batch = metrics.quantise(torch.from_numpy(resized))
+    if border:
+        batch = blacken_border(batch, border)
     trunks = (trunk, None if lpips is None else lpips.trunk)
     with torch.no_grad():
         # Convolutions are as fast in either layout, pooling and norms over channels twice as fast in this one.
@@ -216,7 +225,7 @@ def score(
             looks = [known[id(picture)] for picture in shown[view.name].values()]
             coverage = resize_image(forecast.frames[step][view.name].coverage, *truth.size)
             wanted, seen = truth.look(view, index + first + step), torch.from_numpy(coverage >= SEEN)[None]
-            of_view = _scores(looks, wanted, seen, truth.lpips)
+            of_view = _scores(looks, wanted, seen, truth)
             for row, method in enumerate(shown[view.name]):
                 of_method = scores.setdefault((view.name, method), {name: [] for name in of_view})
                 for name, values in of_view.items():
@@ -231,18 +240,19 @@ def _looks(pictures: Iterable[NDArray[np.float32]], known: Mapping[int, Look], t
     once."""
     wanted = {id(picture): picture for picture in pictures}
     new = {key: picture for key, picture in wanted.items() if key not in known}
-    found = look(list(new.values()), truth.size, truth.trunk, truth.lpips) if new else []
+    found = look(list(new.values()), truth.size, truth.trunk, truth.lpips, truth.border) if new else []
     return {key: known[key] for key in wanted if key in known} | dict(zip(new, found, strict=True))
 
 
-def _scores(looks: Sequence[Look], wanted: Look, seen: torch.Tensor, lpips: Lpips | None) -> dict[str, torch.Tensor]:
+def _scores(looks: Sequence[Look], wanted: Look, seen: torch.Tensor, truth: Truth) -> dict[str, torch.Tensor]:
     """Of M pictures, all metrics that the size allows, [M] each."""
-    pictures = torch.cat([each.picture for each in looks])
+    pictures, lpips = torch.cat([each.picture for each in looks]), truth.lpips
     target = wanted.picture.expand_as(pictures)
     side = min(pictures.shape[2:])
     scores = {"psnr": metrics.psnr(pictures, target)}
     if side >= metrics.WINDOW:
-        scores["ssim"] = metrics.ssim(pictures, target)
+        beyond = [metrics.WINDOW // 2] * 4 if truth.border else [0] * 4
+        scores["ssim"] = metrics.ssim(functional.pad(pictures, beyond), functional.pad(target, beyond))
     if side >= metrics.MS_SSIM_SIDE:
         scores["ms_ssim"] = metrics.ms_ssim(pictures, target)
     if wanted.maps:
@@ -250,6 +260,8 @@ def _scores(looks: Sequence[Look], wanted: Look, seen: torch.Tensor, lpips: Lpip
     if lpips is not None:
         heads = list(lpips.heads)
         scores["lpips"] = torch.cat([distance(each.lpips_maps, wanted.lpips_maps, heads) for each in looks])
+    if truth.border:
+        seen = blacken_border(seen, truth.border)
     scores["psnr_seen"] = metrics.psnr(pictures, target, seen.expand(len(pictures), -1, -1, -1))
     return scores
 
