@@ -302,7 +302,7 @@ def frames(folder: Path) -> list[Path]:
 def read(folder: Path) -> list[Any]:
     """All that a prepared clip gives, as values that compare."""
     clip = PreparedClip.open(folder)
-    values: list[Any] = [clip.name, clip.kind, clip.fps, clip.size, len(clip)]
+    values: list[Any] = [clip.name, clip.kind, clip.interval, clip.positions.tobytes(), clip.size, len(clip)]
     for index in range(len(clip)):
         frame, right, pose = clip.frame(index), clip.right(index), clip.world_from_cam(index)
         values += [clip.frame_name(index), clip.image(index).tobytes(), None if pose is None else pose.tobytes()]
