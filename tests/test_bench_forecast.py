@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from st_lpips_weights import public_state
 
 from vestcl import cli, metrics, perceptual
 from vestcl.bench import _forecast_tables as tables
@@ -226,7 +227,8 @@ def test_what_cannot_be_is_told(settings: dict[str, Any], message: str) -> None:
 
 def test_a_run_prints_and_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, markdown = tmp_path / "new" / "scores.json", tmp_path / "new" / "scores.md"
-    bench.main(ForecastBench(("street:4",), **TINY, out=out, markdown=markdown))
+    torch.save(public_state(), tmp_path / "st.pth")
+    bench.main(ForecastBench(("street:4",), **TINY, st_lpips=tmp_path / "st.pth", out=out, markdown=markdown))
     printed, results = capsys.readouterr().out, json.loads(out.read_text(encoding="utf-8"))
     assert {"vestcl", "device", "torch"} <= set(results["machine"])
     (told,) = results["inputs"]
@@ -241,6 +243,8 @@ def test_a_run_prints_and_writes_everything(tmp_path: Path, capsys: pytest.Captu
     assert best[TRUE_POSES] > best[REPEAT] and best[GEOMETRIC] > best[REPEAT]
     assert set(told["facts"]) >= {"rotation_deg", "motion_m", "splatter_loss_db"}
     assert told["facts"]["splatter_loss_db"][0] < 3
+    assert told["views"]["source"][GEOMETRIC]["by_horizon"]["st_lpips"][0] > 0
+    assert "ST-LPIPS" in printed and "without --st-lpips" not in printed
     assert "without --squeeze" in printed and "mean over 3 windows" in printed and "wrote" in printed
     assert f"| {TRUE_POSES} |" in markdown.read_text(encoding="utf-8")
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from data_files import write_pictures, write_text
 from forecast_clips import FRAMES, HEIGHT, WIDTH, Repeater, write_clip
+from st_lpips_weights import public_state
 from stand_ins import put_module
 
 from vestcl import cli, runtime
@@ -200,11 +201,18 @@ def test_a_long_table_shows_some_steps(
     assert row[2:] == [f"{value:.2f}" for value in (*(values[step - 1] for step in (1, 4, 6, 9, 12)), np.mean(values))]
 
 
-def test_squeeze_weights(folder: Path, tmp_path: Path, repeater: Repeater) -> None:
+def test_weights_of_distances(
+    folder: Path, tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
+) -> None:
     torch.save(Trunk("squeezenet1_0").state_dict(), tmp_path / "squeeze.pth")
+    torch.save(public_state(), tmp_path / "st.pth")
     told = f"forecast {folder} --out {tmp_path / 'out'} --steps 1 --compare --squeeze {tmp_path / 'squeeze.pth'}"
-    assert cli.main(told.split()) == 0
-    assert read_forecast(tmp_path / "out").about["scores"]["source"]["forecast"][0]["squeeze"] > 0
+    assert cli.main([*told.split(), "--st-lpips", str(tmp_path / "st.pth")]) == 0
+    saved = read_forecast(tmp_path / "out").about
+    scores = saved["scores"]["source"]["forecast"][0]
+    assert scores["squeeze"] > 0 and scores["st_lpips"] > 0 and "lpips" not in scores
+    assert saved["settings"]["st_lpips"] == str(tmp_path / "st.pth")
+    assert "ST-LPIPS" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -223,6 +231,8 @@ def test_squeeze_weights(folder: Path, tmp_path: Path, repeater: Repeater) -> No
         ("--model vest-xl", "vest-xl: is no model: no file, no checkpoint's folder, and none of vest-s"),
         ("--squeeze x.pth", "`squeeze` is a distance to the truth; it needs `compare`"),
         ("--squeeze x.pth --compare --steps 1", "no squeezenet1_0 weights at x.pth"),
+        ("--st-lpips", "`st_lpips` is a distance to the truth; it needs `compare`"),
+        ("--st-lpips x.pth --compare --steps 1", "no ST-LPIPS weights at x.pth"),
         ("--fov 90", "camera.json: tells the camera; leave out `fov`"),
         ("--rig grey", "is folder, which takes fov, not rig"),
         ("--depth nowhere", "nowhere: has no 0000 ending in .png, .exr, .npy"),

@@ -104,7 +104,7 @@ def test_the_files_tell_the_same(whole: tuple[dict[str, Any], Path]) -> None:
     best = told["summary"]["source"]["tiny"]["by_horizon"]["psnr"]
     assert f"| tiny | {best[0]:.2f} | {best[1]:.2f} |" in text
     assert "view source, model less geometric" in text and "view camera, model less constant velocity" in text
-    assert "by clip" in text and "| street 4 | 1 |" in text and "LPIPS (--lpips)" in text
+    assert "by clip" in text and "| street 4 | 1 |" in text and "LPIPS (--lpips), ST-LPIPS (--st-lpips)" in text
     sheets = [read_pixels(out / f"sheet_{word}.png") for word in ("best", "median", "worst")]
     assert {sheet.shape for sheet in sheets} == {sheets[0].shape}
     assert sheets[0].shape[0] > 2 * SIZE[0] and sheets[0].shape[1] > 5 * SIZE[1]  # two steps, five pictures each

@@ -1,12 +1,14 @@
 """train.evaluate_windows: what one window is given, and how it is scored."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from forecaster_scenes import TINY, stir
+from st_lpips_weights import public_state
 
 from train.evaluate_inputs import PAIR, known_of
 from train.evaluate_windows import CAMERA, Setup, forecast, perceptions_of, prepared, presenters, views_of, window
@@ -19,7 +21,7 @@ from vestcl.geometric import Perception, forecast_frames
 from vestcl.models.config import configuration
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.trunks import Trunk
-from vestcl.perceptual import LPIPS_SCALING, Lpips, squeeze_distance
+from vestcl.perceptual import LPIPS_SCALING, Lpips, StLpips, squeeze_distance
 from vestcl.scoring import GEOMETRIC, SOURCE, Truth
 from vestcl.views import parse_view
 
@@ -44,14 +46,16 @@ def decibels(got: np.ndarray, wanted: np.ndarray) -> float:
     return float(metrics.psnr(eight_bit(got), eight_bit(wanted)))
 
 
-def test_scores_are_those_of_the_metrics() -> None:
-    """Of the geometric forecast's picture at t+1: LPIPS and squeeze distance with random weights, PSNR, SSIM."""
+def test_scores_are_those_of_the_metrics(tmp_path: Path) -> None:
+    """Of the geometric forecast's image at t+1; LPIPS, ST-LPIPS and squeeze distance with random weights."""
     torch.manual_seed(0)
     trunk = Trunk("squeezenet1_0").requires_grad_(False).eval()
     alex = Trunk("alexnet", LPIPS_SCALING).requires_grad_(False).eval()
     lpips = Lpips(alex, [torch.rand(channels) for channels in alex.channels])
-    clip = street()
-    records = window(Perception(clip), Truth(clip, SIZE, trunk, lpips), 2, setup(trunk=trunk, lpips=lpips))
+    torch.save(public_state(), tmp_path / "st.pth")
+    st_lpips = StLpips.load(tmp_path / "st.pth")
+    clip, networks = street(), {"trunk": trunk, "lpips": lpips, "st_lpips": st_lpips}
+    records = window(Perception(clip), Truth(clip, SIZE, **networks), 2, setup(**networks))
     (found,) = [record for record in records if (record.view, record.method) == (SOURCE, GEOMETRIC)]
     made = forecast_frames(Perception(clip), 2, 1, [SOURCE_VIEW])
     pair = eight_bit(made.frames[0][SOURCE].image), eight_bit(clip[3].read_image())
@@ -59,6 +63,7 @@ def test_scores_are_those_of_the_metrics() -> None:
         "psnr": metrics.psnr(*pair),
         "ssim": metrics.ssim(*pair),
         "lpips": lpips(*pair),
+        "st_lpips": st_lpips(*pair),
         "squeeze": squeeze_distance(*pair, trunk),
     }
     for name, value in wanted.items():

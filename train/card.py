@@ -239,7 +239,8 @@ def _evaluate_command(told: dict[str, Any], weights: Weights) -> str:
         if option in usual and option != "protocol" and value is not None and given != usual[option]:
             words.append(f"--{option}" + ("" if value is True else f" {value}" if given is value else
                                           " " + " ".join(map(str, given))))  # fmt: skip
-    return " ".join([*words, *(["--squeeze WEIGHTS"] if "squeeze" in told["weights"] else [])])
+    measured = {"squeeze": "--squeeze WEIGHTS", "st_lpips": "--st-lpips"}
+    return " ".join([*words, *(option for name, option in measured.items() if name in told["weights"])])
 
 
 def _machine(told: dict[str, str]) -> str:

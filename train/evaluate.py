@@ -32,21 +32,22 @@ from train.evaluate_sheets import write_sheets
 from train.evaluate_windows import PART_WINDOWS, Part, Setup, plan, prepared, read_part, run_part
 from train.protocols import HELD_OUT, NOW_NOTE, PROTOCOLS, Name, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
-from vestcl import __version__, runtime
+from vestcl import __version__, runtime, st_lpips
 from vestcl.bench import _results
 from vestcl.io.atomic import write_bytes
 from vestcl.metrics import MS_SSIM_SIDE
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.trunks import load_trunk
-from vestcl.perceptual import Lpips
+from vestcl.perceptual import Lpips, StLpips
 from vestcl.prepare_command import shard
 from vestcl.scoring import GEOMETRIC, Record, to_rich
+from vestcl.st_lpips import Option as StLpipsOption
 
 #: Columns where tables don't go to a terminal.
 WIDTH: Final = 200
 
 #: Settings that scores do not depend on, or that stand in the key as the content of files.
-_NOT_IN_KEY: Final = ("model", "squeeze", "lpips", "out", "shard", "merge", "device", "horizons", "sheets")
+_NOT_IN_KEY: Final = ("model", "squeeze", "lpips", "st_lpips", "out", "shard", "merge", "device", "horizons", "sheets")
 
 #: Of the scores' files: raised when what a window is given or how it is scored changes.
 _SCORING: Final = 2
@@ -71,6 +72,8 @@ class Evaluation:
     """SqueezeNet 1.0 weights, for the distance in its features."""
     lpips: tuple[Path, Path] | None = None
     """Weights of AlexNet (torchvision) and of LPIPS's heads (v0.1)."""
+    st_lpips: StLpipsOption = None
+    """Measure ST-LPIPS, by the weights FILE or those inside an installed stlpips-pytorch."""
     height: int | None = None
     """Pixels; without it the protocol's."""
     width: int | None = None
@@ -193,7 +196,9 @@ def setup_of(config: Evaluation, protocol: Protocol) -> Setup:
     models = {path.stem: Forecaster.load(path) for path in config.model}
     trunk = None if config.squeeze is None else load_trunk("squeezenet1_0", config.squeeze)
     lpips = None if config.lpips is None else Lpips.load("alexnet", *config.lpips)
-    return Setup(protocol, protocol.size, protocol.steps, models, config.mode, config.stereo, trunk, lpips)
+    shift_tolerant = None if config.st_lpips is None else StLpips.load(config.st_lpips)
+    size, steps = protocol.size, protocol.steps
+    return Setup(protocol, size, steps, models, config.mode, config.stereo, trunk, lpips, shift_tolerant)
 
 
 def _where(config: Evaluation, protocol: Protocol) -> Where:
@@ -210,6 +215,7 @@ def _about(config: Evaluation, protocol: Protocol) -> dict[str, Any]:
     changed = {"data": None if config.data is None else str(config.data.resolve())}
     effective = {k: getattr(protocol, k) for k in ("size", "steps", "first", "last")}
     weights = {"squeeze": config.squeeze} | dict(zip(("alexnet", "lpips"), config.lpips or (), strict=False))
+    weights["st_lpips"] = None if config.st_lpips is None else st_lpips.find_weights(config.st_lpips)
     return {
         "vestcl": __version__,
         "settings": settings | changed | effective,
@@ -233,8 +239,8 @@ def _sha256(path: Path) -> str:
 def _caveats(config: Evaluation, setup: Setup) -> list[str]:
     """What was not measured, and what differs from what is published."""
     protocol, told = setup.protocol, list[str]()
-    absent = ["LPIPS (--lpips)"] * (config.lpips is None) + ["squeeze distance (--squeeze)"] * (config.squeeze is None)
-    if absent:
+    names = {"lpips": "LPIPS (--lpips)", "st_lpips": "ST-LPIPS (--st-lpips)", "squeeze": "squeeze distance (--squeeze)"}
+    if absent := [name for option, name in names.items() if getattr(config, option) is None]:
         told.append(f"Without weights, not measured: {', '.join(absent)}.")
     if min(setup.size) < MS_SSIM_SIDE:
         told.append(f"MS-SSIM needs {MS_SSIM_SIDE} pixels a side, got {setup.size[0]} x {setup.size[1]}.")

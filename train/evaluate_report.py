@@ -38,7 +38,7 @@ CLIP_ROWS: Final = 60
 
 #: The first of each that there is stands for likeness and for distance where a table has room for no more.
 LIKENESS: Final = ("ms_ssim", "ssim", "psnr")
-DISTANCE: Final = ("lpips", "squeeze")
+DISTANCE: Final = ("lpips", "st_lpips", "squeeze")
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from vestcl.geometric import Perception, forecast_frames, show_frame
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.trunks import Trunk
-from vestcl.perceptual import Lpips
+from vestcl.perceptual import Lpips, StLpips
 from vestcl.scoring import (
     GEOMETRIC,
     OTHER_CAMERA,
@@ -73,6 +73,7 @@ class Setup:
     trunk: Trunk | None = None
     """SqueezeNet 1.0."""
     lpips: Lpips | None = None
+    st_lpips: StLpips | None = None
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def run_part(part: Part, setup: Setup, advance: Callable[[], None] = lambda: Non
     """
     clip = prepared(part.source.opens(), setup)
     perceptions = perceptions_of(clip, setup)
-    truth = Truth(clip, setup.size, setup.trunk, setup.lpips)
+    truth = Truth(clip, setup.size, setup.trunk, setup.lpips, setup.st_lpips)
     records: list[Record] = []
     for index in part.indices:
         truth.forget(index - 1)
@@ -256,7 +257,7 @@ def _network_shows(model: Forecaster, perception: Perception, index: int, views:
 def _now(perception: Perception, truth: Truth, index: int, setup: Setup) -> list[Record]:
     """The right camera's image at t, by who can show it, and what the source camera sees; scored as VEST-MPI does."""
     clip = truth.clip
-    truth = Truth(clip, truth.size, truth.trunk, truth.lpips, NOW_BORDER)
+    truth = Truth(clip, truth.size, truth.trunk, truth.lpips, truth.st_lpips, NOW_BORDER)
     view = dataclasses.replace(parse_view(RIGHT, clip), name=NOW)
     methods = {AS_SEEN: Prediction([truth.full(parse_view(SOURCE, clip), index)], 0.0)}
     made = {name: _timed(functools.partial(by, perception, index, [view])) for name, by in presenters(setup).items()}

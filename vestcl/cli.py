@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from vestcl import __version__, doctor, runtime
+from vestcl.st_lpips import Option as StLpipsOption
 
 #: `vestcl bench train-step` is vestcl.bench.train_step; its ``main`` takes a TrainStepBench, may return an exit code.
 _BENCHES: Final = (
@@ -138,6 +139,8 @@ class Forecast:
     """Score forecast and baselines (with --model geometry, too) against the frames that the clip goes on with."""
     squeeze: Path | None = None
     """With --compare: SqueezeNet 1.0 weights for a distance in its features."""
+    st_lpips: StLpipsOption = None
+    """With --compare: measure ST-LPIPS, by the weights FILE or those inside an installed stlpips-pytorch."""
     height: int | None = None
     """Pixels; without it as the clip is, or in proportion to --width."""
     width: int | None = None

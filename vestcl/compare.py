@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from vestcl import baselines, metrics, sheet
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.forecast import Forecast, View
 from vestcl.models.trunks import Trunk
-from vestcl.perceptual import squeeze_distance
+from vestcl.perceptual import StLpips, squeeze_distance
 from vestcl.sheet import Cell, Picture
 from vestcl.views import seen_by
 
@@ -33,6 +33,7 @@ METRICS: Final = {
     "psnr": ("PSNR, dB", ".2f"),
     "ssim": ("SSIM", ".4f"),
     "ms_ssim": ("MS-SSIM", ".4f"),
+    "st_lpips": ("ST-LPIPS", ".4f"),
     "squeeze": ("squeeze distance", ".4f"),
 }
 
@@ -57,6 +58,7 @@ def compare(
     views: Sequence[View],
     trunk: Trunk | None = None,
     report: Callable[[float], None] | None = None,
+    st_lpips: StLpips | None = None,
 ) -> list[Comparison]:
     """Score every view that a camera of the rig really saw, step by step as long as the clip has a frame at that time.
 
@@ -70,6 +72,7 @@ def compare(
         views: the cameras; those that nobody looked from are passed over.
         trunk: SqueezeNet 1.0, for the squeeze distance (`vestcl.perceptual.squeeze_distance`).
         report: told the share of the views that are done, 0 to 1.
+        st_lpips: for ST-LPIPS (`vestcl.perceptual.StLpips`).
 
     Returns:
         A comparison for each view that has a truth.
@@ -91,7 +94,7 @@ def compare(
         raise ValueError('`views` must have one with a truth to compare with: "source", or "right" of a stereo clip')
     comparisons = []
     for done, view in enumerate(known, start=1):
-        comparisons.append(_compare_view(forecast, clip, index, view, trunk))
+        comparisons.append(_compare_view(forecast, clip, index, view, _Networks(trunk, st_lpips)))
         if report is not None:
             report(done / len(known))
     return comparisons
@@ -122,7 +125,14 @@ def comparison_sheet(comparison: Comparison, title: str = "") -> Picture:
     return sheet.sheet(rows, title=f"{title}{note}", bar=scale)
 
 
-def _compare_view(forecast: Forecast, clip: Clip, index: int, view: View, trunk: Trunk | None) -> Comparison:
+class _Networks(NamedTuple):
+    """That images are compared by, as far as their weights are known."""
+
+    squeeze: Trunk | None
+    st_lpips: StLpips | None
+
+
+def _compare_view(forecast: Forecast, clip: Clip, index: int, view: View, networks: _Networks) -> Comparison:
     later = clip.after(index, len(forecast.frames))
     steps = len(later)
     previous, current, *truth = (_read(view, clip[at]) for at in (index - 1, index, *later))
@@ -131,7 +141,7 @@ def _compare_view(forecast: Forecast, clip: Clip, index: int, view: View, trunk:
     for name, forecaster in ((REPEAT, baselines.repeat_last), (FLOW, flow)):
         images[name] = list(forecaster(_batch(previous), _batch(current), steps)[0].numpy())
     scores = {
-        method: [_scores(image, wanted, trunk) for image, wanted in zip(of_method, truth, strict=True)]
+        method: [_scores(image, wanted, networks) for image, wanted in zip(of_method, truth, strict=True)]
         for method, of_method in images.items()
     }
     return Comparison(view.name, images, truth, scores, isinstance(seen_by(view, clip[index]), RightCamera))
@@ -144,7 +154,7 @@ def _read(view: View, sample: Sample) -> NDArray[np.float32]:
     return camera.read_image()
 
 
-def _scores(image: NDArray[np.float32], truth: NDArray[np.float32], trunk: Trunk | None) -> dict[str, float]:
+def _scores(image: NDArray[np.float32], truth: NDArray[np.float32], networks: _Networks) -> dict[str, float]:
     """All metrics that the size allows."""
     pair = metrics.quantise(_batch(image)), metrics.quantise(_batch(truth))
     side = min(truth.shape[1:])
@@ -153,9 +163,11 @@ def _scores(image: NDArray[np.float32], truth: NDArray[np.float32], trunk: Trunk
         scores["ssim"] = metrics.ssim(*pair)
     if side >= metrics.MS_SSIM_SIDE:
         scores["ms_ssim"] = metrics.ms_ssim(*pair)
-    if trunk is not None:
-        with torch.no_grad():
-            scores["squeeze"] = squeeze_distance(*pair, trunk)
+    with torch.no_grad():
+        if networks.st_lpips is not None:
+            scores["st_lpips"] = networks.st_lpips(*pair)
+        if networks.squeeze is not None:
+            scores["squeeze"] = squeeze_distance(*pair, networks.squeeze)
     return {name: float(score) for name, score in scores.items()}
 
 

@@ -22,6 +22,7 @@ from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Skipped, View
 from vestcl.models.trunks import load_trunk
+from vestcl.perceptual import StLpips
 from vestcl.views import parse_views
 
 if TYPE_CHECKING:
@@ -91,15 +92,16 @@ def run(options: "cli.Forecast") -> None:
             index = current_frame(clip, options)
             views = parse_views(options.view or ("source",), clip[index])
             trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
+            st_lpips = None if options.st_lpips is None else StLpips.load(options.st_lpips)
         forecast = _forecast(clip, index, options, views, stages, model)
         stages.seconds |= forecast.seconds
         comparisons = []
         if options.compare:
             with stages.stage("compare") as report:
-                comparisons = compare.compare(forecast, clip, index, views, trunk, report)
+                comparisons = compare.compare(forecast, clip, index, views, trunk, report, st_lpips)
                 if model is not None:
                     rival = _forecast(clip, index, options, views, stages)
-                    rivals = compare.compare(rival, clip, index, views, trunk)
+                    rivals = compare.compare(rival, clip, index, views, trunk, st_lpips=st_lpips)
                     comparisons = [_beside(*pair, rival.method) for pair in zip(comparisons, rivals, strict=True)]
         with stages.stage(forecast_files.WRITING) as report:
             details = _details(options, clip, index, forecast, comparisons)
@@ -164,8 +166,9 @@ def _check(options: "cli.Forecast") -> None:
             raise ValueError(f"`{name}` must be 1 or more, got {value}")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"`out` must be a folder, got the file {options.out}")
-    if options.squeeze is not None and not options.compare:
-        raise ValueError("`squeeze` is a distance to the truth; it needs `compare`")
+    for name in ("squeeze", "st_lpips"):
+        if getattr(options, name) is not None and not options.compare:
+            raise ValueError(f"`{name}` is a distance to the truth; it needs `compare`")
     if options.mode is not None and options.model is None:
         raise ValueError("`mode` is how a network goes on after its first step; it needs `model`")
     if options.quality is not None and options.model is None:

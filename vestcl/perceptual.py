@@ -1,4 +1,4 @@
-"""Distances between images in the features of a classifier: LPIPS, one without learnt heads, and a training loss.
+"""Distances between images in the features of a classifier: LPIPS, ST-LPIPS, one without heads, and a training loss.
 
 Each takes two images [B, 3, H, W] in [0, 1], RGB, and answers with [B]; 0 for equal images. All are differentiable in
 both images; the classifiers' weights (vestcl.models.trunks) come from files and stay as they are. As metrics they
@@ -14,7 +14,9 @@ from torch import nn
 
 from vestcl.models._layers import check
 from vestcl.models._weights import check_finite, read_state_dict
+from vestcl.models.shift_tolerant import ShiftTolerantTrunk, load_shift_tolerant
 from vestcl.models.trunks import Normalisation, Trunk, load_trunk
+from vestcl.st_lpips import INSTALLED, REMEDY, find_weights
 
 #: LPIPS's own scaling layer, after 2 x - 1: ImageNet's mean and deviation on [-1, 1], in three digits.
 LPIPS_SCALING: Final = Normalisation((-0.030, -0.088, -0.188), (0.458, 0.448, 0.450), gain=2.0, offset=-1.0)
@@ -29,48 +31,16 @@ _EPSILON: Final = 1e-10
 VGG_WEIGHTS: Final = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1.0)
 
 
-class Lpips(nn.Module):
-    """sum_l mean_hw sum_c w_lc (f_lc / |f_l| - g_lc / |g_l|)^2 over a trunk's maps f and g of the two images.
+class _LearntDistance(nn.Module):
+    """sum_l mean_hw sum_c w_lc (f_lc / |f_l| - g_lc / |g_l|)^2: a trunk, and heads w that were learnt on it."""
 
-    Args:
-        trunk: "alexnet" or "vgg16", with LPIPS_SCALING.
-        heads: one weight a channel, for each map: [C_l].
-
-    Raises:
-        ValueError: another trunk or normalisation, or heads of other sizes.
-
-    Source: Zhang, Isola, Efros, Shechtman, Wang: The Unreasonable Effectiveness of Deep Features as a Perceptual
-    Metric, 2018; version 0.1 of its public weights.
-    """
-
-    def __init__(self, trunk: Trunk, heads: Sequence[torch.Tensor]) -> None:
+    def __init__(self, trunk: Trunk | ShiftTolerantTrunk, heads: Sequence[torch.Tensor], name: str) -> None:
         super().__init__()
-        if trunk.name not in _HEADS or trunk.normalisation != LPIPS_SCALING:
-            got = f"{trunk.name} with {trunk.normalisation}"
-            raise ValueError(f"`trunk` must be {' or '.join(_HEADS)} with LPIPS_SCALING, got {got}")
         if [list(head.shape) for head in heads] != [[channels] for channels in trunk.channels]:
             got = ", ".join(str(list(head.shape)) for head in heads)
-            raise ValueError(f"`heads` must be of sizes {list(trunk.channels)} for {trunk.name}, got {got}")
+            raise ValueError(f"`heads` must be of sizes {list(trunk.channels)} for {name}, got {got}")
         self.trunk = trunk
         self.heads = nn.ParameterList(head.detach().clone() for head in heads).requires_grad_(False)
-
-    @classmethod
-    def load(cls, name: str, trunk_path: Path | str, heads_path: Path | str) -> "Lpips":
-        """LPIPS v0.1 from its two public files.
-
-        Args:
-            name: "alexnet", which published figures use, or "vgg16".
-            trunk_path: torchvision's classifier of that name (see `load_trunk`).
-            heads_path: the linear heads, lin0.model.1.weight [1, C, 1, 1] to lin4.model.1.weight.
-
-        Raises:
-            FileNotFoundError: one of the files is absent; the message says how to get it.
-            ValueError: another name, or a file that holds something else.
-        """
-        if name not in _HEADS:
-            raise ValueError(f"`name` must be {' or '.join(_HEADS)}, got {name!r}")
-        trunk = load_trunk(name, trunk_path, LPIPS_SCALING)
-        return cls(trunk, _read_heads(name, Path(heads_path), trunk.channels))
 
     def forward(self, prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """The distance.
@@ -91,6 +61,79 @@ class Lpips(nn.Module):
             for pair, head in zip(maps, self.heads, strict=True)
         ]
         return torch.stack(layers).sum(dim=0)
+
+
+class Lpips(_LearntDistance):
+    """sum_l mean_hw sum_c w_lc (f_lc / |f_l| - g_lc / |g_l|)^2 over a trunk's maps f and g of the two images.
+
+    Args:
+        trunk: "alexnet" or "vgg16", with LPIPS_SCALING.
+        heads: one weight a channel, for each map: [C_l].
+
+    Raises:
+        ValueError: another trunk or normalisation, or heads of other sizes.
+
+    Source: Zhang, Isola, Efros, Shechtman, Wang: The Unreasonable Effectiveness of Deep Features as a Perceptual
+    Metric, 2018; version 0.1 of its public weights.
+    """
+
+    def __init__(self, trunk: Trunk, heads: Sequence[torch.Tensor]) -> None:
+        if trunk.name not in _HEADS or trunk.normalisation != LPIPS_SCALING:
+            got = f"{trunk.name} with {trunk.normalisation}"
+            raise ValueError(f"`trunk` must be {' or '.join(_HEADS)} with LPIPS_SCALING, got {got}")
+        super().__init__(trunk, heads, trunk.name)
+
+    @classmethod
+    def load(cls, name: str, trunk_path: Path | str, heads_path: Path | str) -> "Lpips":
+        """LPIPS v0.1 from its two public files.
+
+        Args:
+            name: "alexnet", which published figures use, or "vgg16".
+            trunk_path: torchvision's classifier of that name (see `load_trunk`).
+            heads_path: the linear heads, lin0.model.1.weight [1, C, 1, 1] to lin4.model.1.weight.
+
+        Raises:
+            FileNotFoundError: one of the files is absent; the message says how to get it.
+            ValueError: another name, or a file that holds something else.
+        """
+        if name not in _HEADS:
+            raise ValueError(f"`name` must be {' or '.join(_HEADS)}, got {name!r}")
+        trunk = load_trunk(name, trunk_path, LPIPS_SCALING)
+        return cls(trunk, _read_heads(name, Path(heads_path), trunk.channels))
+
+
+class StLpips(_LearntDistance):
+    """ST-LPIPS: LPIPS's formula over the shift-tolerant AlexNet's maps, with weights and heads of its own.
+
+    It hardly sees a shift of the whole image by a pixel. It is a metric of its own: not LPIPS, and not comparable with
+    LPIPS's figures.
+
+    Args:
+        trunk: of the five maps.
+        heads: one weight a channel, for each map: [C_l].
+
+    Raises:
+        ValueError: heads of other sizes.
+
+    Source: Ghildyal, Liu: Shift-tolerant Perceptual Similarity Metric, ECCV 2022; its public weights vST0.0.
+    """
+
+    def __init__(self, trunk: ShiftTolerantTrunk, heads: Sequence[torch.Tensor]) -> None:
+        super().__init__(trunk, heads, "ST-LPIPS")
+
+    @classmethod
+    def load(cls, source: Path | str = INSTALLED) -> "StLpips":
+        """ST-LPIPS with its public weights.
+
+        Args:
+            source: alex_shift_tolerant.pth, or "installed" for that file inside an installed ``stlpips-pytorch``,
+                which is not imported.
+
+        Raises:
+            FileNotFoundError: no such file or package; the message says how to get it.
+            ValueError: a file that is damaged or holds something else.
+        """
+        return cls(*load_shift_tolerant(find_weights(source), REMEDY))
 
 
 def squeeze_distance(prediction: torch.Tensor, target: torch.Tensor, trunk: Trunk) -> torch.Tensor:
@@ -155,7 +198,9 @@ class VggLoss(nn.Module):
         return torch.stack([weight * (f - g).abs().mean(dim=(1, 2, 3)) for weight, (f, g) in pairs]).sum(dim=0)
 
 
-def _both(trunk: Trunk, prediction: torch.Tensor, target: torch.Tensor) -> list[tuple[torch.Tensor, torch.Tensor]]:
+def _both(
+    trunk: Trunk | ShiftTolerantTrunk, prediction: torch.Tensor, target: torch.Tensor
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """The maps of both images, in pairs. One pass each: a target that needs no gradient then keeps nothing for it."""
     check(prediction=(prediction, "B 3 H W"), target=(target, "B 3 H W"))
     return list(zip(trunk(prediction), trunk(target), strict=True))

@@ -27,7 +27,9 @@ from vestcl.forecast import View
 from vestcl.geometric import Perception
 from vestcl.io.atomic import write_bytes
 from vestcl.models.trunks import Trunk, load_trunk
+from vestcl.perceptual import StLpips
 from vestcl.scoring import SOURCE, Record, Truth
+from vestcl.st_lpips import Option as StLpipsOption
 from vestcl.views import parse_views
 
 #: Streets that nothing is tuned, trained or tested on: what "street:" stands for.
@@ -64,6 +66,8 @@ class ForecastBench:
     """Cameras to be judged from; right only where a clip has one."""
     squeeze: Path | None = None
     """SqueezeNet 1.0 weights, for the distance in its features."""
+    st_lpips: StLpipsOption = None
+    """Measure ST-LPIPS, by the weights FILE or those inside an installed stlpips-pytorch."""
     pool: bool = False
     """One table over all inputs instead of one for each."""
     street_size: tuple[int, int] = (256, 832)
@@ -78,6 +82,15 @@ class ForecastBench:
     """JSON file for the scores of every window, and their means."""
     markdown: Path | None = None
     """File for the tables as Markdown."""
+
+
+@dataclass(frozen=True)
+class Networks:
+    """Whose weights were given."""
+
+    squeeze: Trunk | None = None
+    """SqueezeNet 1.0."""
+    st_lpips: StLpips | None = None
 
 
 @dataclass
@@ -101,14 +114,16 @@ def main(config: ForecastBench) -> None:
     console = _results.console(WIDTH)
     with runtime.use(config.device) as session:
         machine = _results.describe(session)
-        trunk = None if config.squeeze is None else load_trunk("squeezenet1_0", config.squeeze)
+        networks = _networks(config)
         groups = _groups(config)
-        _run(groups, config, trunk, console)
+        _run(groups, config, networks, console)
     grids = [grid for group in groups for grid in _grids(group, config.horizons)]
     for grid in grids:
         console.print(tables.to_rich(grid))
-    if trunk is None:
+    if networks.squeeze is None:
         console.print("without --squeeze there is no squeeze distance", highlight=False)
+    if networks.st_lpips is None:
+        console.print("without --st-lpips there is no ST-LPIPS", highlight=False)
     console.print(f"{machine['device']}, {machine['cores']} cores", highlight=False, soft_wrap=True)
     _write(config, machine, groups, grids, console)
 
@@ -123,6 +138,13 @@ def _check(config: ForecastBench) -> None:
         raise ValueError(f"`horizons` must be steps, 1 ... {config.steps}, got {config.horizons}")
     if not config.views or len(set(config.views)) < len(config.views):
         raise ValueError(f"`views` must be one or more cameras, each once, got {config.views}")
+
+
+def _networks(config: ForecastBench) -> Networks:
+    return Networks(
+        None if config.squeeze is None else load_trunk("squeezenet1_0", config.squeeze),
+        None if config.st_lpips is None else StLpips.load(config.st_lpips),
+    )
 
 
 # ---------------------------------------------------------------- clips and windows
@@ -174,7 +196,7 @@ def windows_of(clip: Clip, config: ForecastBench) -> list[int]:
     return [index for index in chosen if clip.is_whole(index, config.steps)]
 
 
-def _run(groups: Sequence[_Group], config: ForecastBench, trunk: Trunk | None, console: Console) -> None:
+def _run(groups: Sequence[_Group], config: ForecastBench, networks: Networks, console: Console) -> None:
     """Fill the groups."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal)
@@ -184,21 +206,21 @@ def _run(groups: Sequence[_Group], config: ForecastBench, trunk: Trunk | None, c
         for group in groups:
             for clip in group.clips:
                 bar.update(task, description=clip.name)
-                for records, facts in run_clip(clip, config, trunk):
+                for records, facts in run_clip(clip, config, networks):
                     group.records += records
                     group.facts += facts
                     bar.advance(task)
 
 
 def run_clip(
-    clip: Clip, config: ForecastBench, trunk: Trunk | None = None
+    clip: Clip, config: ForecastBench, networks: Networks = Networks()
 ) -> Iterator[tuple[list[Record], list[Facts]]]:
     """Every window of a clip, in order; each shares what it sees with the next.
 
     Args:
         clip: at its own size.
         config: which windows, views and steps.
-        trunk: SqueezeNet 1.0, or None.
+        networks: that score.
 
     Returns:
         A window's records, and its facts if there are any.
@@ -208,7 +230,7 @@ def run_clip(
     """
     views = views_of(clip, config)
     perception = Perception(clip)
-    truth = Truth(clip, (config.height, config.width), trunk)
+    truth = Truth(clip, (config.height, config.width), networks.squeeze, st_lpips=networks.st_lpips)
     for index in windows_of(clip, config):
         truth.forget(index - 1)
         motion = known.true_motion(clip, index, config.steps)

@@ -16,7 +16,7 @@ from vestcl.data.resize import resize_image
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, View
 from vestcl.models.trunks import Trunk
-from vestcl.perceptual import Lpips, _squared_difference
+from vestcl.perceptual import Lpips, StLpips, _squared_difference
 from vestcl.scoring.border import blacken_border
 from vestcl.views import seen_by
 
@@ -89,6 +89,8 @@ class Look(NamedTuple):
     """SqueezeNet's, [1, C_l, h_l, w_l]; none without a trunk."""
     lpips_maps: list[torch.Tensor]
     """The same of LPIPS's trunk."""
+    st_lpips_maps: list[torch.Tensor] = []  # noqa: RUF012 (a default of a tuple's field, never changed)
+    """The same of ST-LPIPS's trunk."""
 
 
 class Truth:
@@ -99,15 +101,22 @@ class Truth:
         size: (height, width) that is scored, px.
         trunk: SqueezeNet 1.0, or None.
         lpips: or None.
+        st_lpips: or None.
         border: share of each side's outer pixels that are scored as black, in the truth and in what is held against
             it (`vestcl.scoring.border.blacken_border`); SSIM's windows then reach beyond the image, as in VEST-MPI.
     """
 
     def __init__(
-        self, clip: Clip, size: tuple[int, int], trunk: Trunk | None = None, lpips: Lpips | None = None,
+        self,
+        clip: Clip,
+        size: tuple[int, int],
+        trunk: Trunk | None = None,
+        lpips: Lpips | None = None,
+        st_lpips: StLpips | None = None,
         border: float = 0.0,
-    ) -> None:  # fmt: skip
-        self.clip, self.size, self.trunk, self.lpips, self.border = clip, size, trunk, lpips, border
+    ) -> None:
+        self.clip, self.size, self.trunk, self.lpips, self.st_lpips = clip, size, trunk, lpips, st_lpips
+        self.border = border
         self._full: dict[tuple[str, int], NDArray[np.float32]] = {}
         self._looks: dict[tuple[str, int], Look] = {}
 
@@ -129,8 +138,12 @@ class Truth:
         """The same as it is scored."""
         key = view.name, index
         if key not in self._looks:
-            self._looks[key] = look([self.full(view, index)], self.size, self.trunk, self.lpips, self.border)[0]
+            self._looks[key] = self.look_at([self.full(view, index)])[0]
         return self._looks[key]
+
+    def look_at(self, pictures: Pictures) -> list[Look]:
+        """`look` at the size and with the trunks of this truth."""
+        return look(pictures, self.size, self.trunk, self.lpips, self.st_lpips, self.border)
 
     def forget(self, index: int) -> None:
         """Drop frames before ``index``: windows come in order."""
@@ -140,9 +153,13 @@ class Truth:
 
 
 def look(
-    pictures: Pictures, size: tuple[int, int], trunk: Trunk | None = None, lpips: Lpips | None = None,
+    pictures: Pictures,
+    size: tuple[int, int],
+    trunk: Trunk | None = None,
+    lpips: Lpips | None = None,
+    st_lpips: StLpips | None = None,
     border: float = 0.0,
-) -> list[Look]:  # fmt: skip
+) -> list[Look]:
     """Resize, quantise, and take the trunks' maps of all pictures in one go.
 
     Args:
@@ -150,6 +167,7 @@ def look(
         size: (height, width) px.
         trunk: SqueezeNet 1.0, or None.
         lpips: or None.
+        st_lpips: or None.
         border: as `Truth` has it.
 
     Raises:
@@ -159,7 +177,7 @@ def look(
     batch = metrics.quantise(torch.from_numpy(resized))
     if border:
         batch = blacken_border(batch, border)
-    trunks = (trunk, None if lpips is None else lpips.trunk)
+    trunks = (trunk, *(None if learnt is None else learnt.trunk for learnt in (lpips, st_lpips)))
     with torch.no_grad():
         # Convolutions are as fast in either layout, pooling and norms over channels twice as fast in this one.
         maps = [[] if one is None else one(batch.contiguous(memory_format=torch.channels_last)) for one in trunks]
@@ -240,7 +258,7 @@ def _looks(pictures: Iterable[NDArray[np.float32]], known: Mapping[int, Look], t
     once."""
     wanted = {id(picture): picture for picture in pictures}
     new = {key: picture for key, picture in wanted.items() if key not in known}
-    found = look(list(new.values()), truth.size, truth.trunk, truth.lpips, truth.border) if new else []
+    found = truth.look_at(list(new.values())) if new else []
     return {key: known[key] for key in wanted if key in known} | dict(zip(new, found, strict=True))
 
 
@@ -257,9 +275,12 @@ def _scores(looks: Sequence[Look], wanted: Look, seen: torch.Tensor, truth: Trut
         scores["ms_ssim"] = metrics.ms_ssim(pictures, target)
     if wanted.maps:
         scores["squeeze"] = torch.cat([distance(each.maps, wanted.maps) for each in looks])
-    if lpips is not None:
-        heads = list(lpips.heads)
+    if truth.lpips is not None:
+        heads = list(truth.lpips.heads)
         scores["lpips"] = torch.cat([distance(each.lpips_maps, wanted.lpips_maps, heads) for each in looks])
+    if truth.st_lpips is not None:
+        heads = list(truth.st_lpips.heads)
+        scores["st_lpips"] = torch.cat([distance(each.st_lpips_maps, wanted.st_lpips_maps, heads) for each in looks])
     if truth.border:
         seen = blacken_border(seen, truth.border)
     scores["psnr_seen"] = metrics.psnr(pictures, target, seen.expand(len(pictures), -1, -1, -1))
@@ -269,7 +290,7 @@ def _scores(looks: Sequence[Look], wanted: Look, seen: torch.Tensor, truth: Trut
 def distance(
     maps: Sequence[torch.Tensor], wanted: Sequence[torch.Tensor], heads: Sequence[torch.Tensor] | None = None
 ) -> torch.Tensor:
-    """`vestcl.perceptual.squeeze_distance`, or with ``heads`` `Lpips`, of maps that are there already: [1].
+    """`vestcl.perceptual.squeeze_distance`, or with ``heads`` `Lpips` or `StLpips`, of maps that are there: [1].
 
     Args:
         maps: [1, C_l, h_l, w_l] a layer.

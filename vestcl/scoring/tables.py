@@ -36,6 +36,7 @@ METRICS: Final = {
     "ssim": Metric("SSIM", ".3f", +1),
     "ms_ssim": Metric("MS-SSIM", ".3f", +1),
     "lpips": Metric("LPIPS", ".3f", -1, "LPIPS: AlexNet, v0.1; 0 = equal."),
+    "st_lpips": Metric("ST-LPIPS", ".3f", -1, "ST-LPIPS: shift-tolerant AlexNet; 0 = equal. It is not LPIPS."),
     "squeeze": Metric("squeeze", ".3f", -1, "squeeze: distance in SqueezeNet's features, 0 = equal. It is not LPIPS."),
     "psnr_seen": Metric(
         "PSNR*", ".2f", +1, "PSNR*: over the pixels that the geometric forecast covers by half or more."
