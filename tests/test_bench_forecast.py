@@ -9,7 +9,7 @@ import pytest
 import torch
 from st_lpips_weights import public_state
 
-from vestcl import cli, metrics, perceptual
+from vestcl import cli, metrics, peer, perceptual
 from vestcl.bench import _forecast_tables as tables
 from vestcl.bench import _forecast_truth as known
 from vestcl.bench import _forecast_windows as windows
@@ -23,6 +23,7 @@ from vestcl.data.sample import Clip, Sample
 from vestcl.forecast import Forecast, Rendered, View
 from vestcl.io.labels import SKY
 from vestcl.models.trunks import Trunk
+from vestcl.models.voxel_flow import VoxelFlowNetwork
 
 SIZE = 64, 208
 TINY: dict[str, Any] = {
@@ -228,14 +229,16 @@ def test_what_cannot_be_is_told(settings: dict[str, Any], message: str) -> None:
 def test_a_run_prints_and_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, markdown = tmp_path / "new" / "scores.json", tmp_path / "new" / "scores.md"
     torch.save(public_state(), tmp_path / "st.pth")
-    bench.main(ForecastBench(("street:4",), **TINY, st_lpips=tmp_path / "st.pth", out=out, markdown=markdown))
+    VoxelFlowNetwork(blocks=[(4, 8), (1, 4)]).save(tmp_path / "peer.safetensors")
+    weights = {"st_lpips": tmp_path / "st.pth", "peer": tmp_path / "peer.safetensors"}
+    bench.main(ForecastBench(("street:4",), **TINY, **weights, out=out, markdown=markdown))
     printed, results = capsys.readouterr().out, json.loads(out.read_text(encoding="utf-8"))
     assert {"vestcl", "device", "torch"} <= set(results["machine"])
     (told,) = results["inputs"]
     assert set(told["views"]) == {"source", "right"}
-    assert set(told["views"]["source"]) == {REPEAT, FLOW, GEOMETRIC, TRUE_POSES}
+    assert set(told["views"]["source"]) == {REPEAT, FLOW, GEOMETRIC, TRUE_POSES, peer.METHOD}
     assert ORACLE in told["views"]["right"]
-    assert len(told["windows"]) == 3 * (4 + 5) and len(told["window_facts"]) == 3
+    assert len(told["windows"]) == 3 * (5 + 6) and len(told["window_facts"]) == 3
     own = [w["scores"]["psnr"] for w in told["windows"] if (w["view"], w["method"]) == ("source", GEOMETRIC)]
     found = told["views"]["source"][GEOMETRIC]["by_horizon"]["psnr"]
     np.testing.assert_allclose(found, np.mean(own, axis=0))
@@ -244,6 +247,7 @@ def test_a_run_prints_and_writes_everything(tmp_path: Path, capsys: pytest.Captu
     assert set(told["facts"]) >= {"rotation_deg", "motion_m", "splatter_loss_db"}
     assert told["facts"]["splatter_loss_db"][0] < 3
     assert told["views"]["source"][GEOMETRIC]["by_horizon"]["st_lpips"][0] > 0
+    assert "DMVFN shape: images by 2D voxel flow" in printed
     assert "ST-LPIPS" in printed and "without --st-lpips" not in printed
     assert "without --squeeze" in printed and "mean over 3 windows" in printed and "wrote" in printed
     assert f"| {TRUE_POSES} |" in markdown.read_text(encoding="utf-8")

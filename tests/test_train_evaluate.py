@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from forecaster_scenes import TINY, stir
+from st_lpips_weights import public_state
 from test_train_protocols import calibration
 
 from train import evaluate, evaluate_windows
@@ -17,6 +18,7 @@ from train.evaluate_inputs import PAIR
 from train.evaluate_leaks import training_overlap
 from train.evaluate_windows import AS_SEEN, CAMERA, CONSTANT_VELOCITY, PART_WINDOWS
 from train.protocols import NOW, Source
+from vestcl import peer
 from vestcl.compare import FLOW, REPEAT
 from vestcl.data import Street
 from vestcl.data.splits import KITTI_PREDICTION_TEST, KITTI_PREDICTION_TRAIN, KITTI_VIEWS_TEST, KITTI_VIEWS_TRAIN
@@ -24,6 +26,7 @@ from vestcl.io import read_pixels, write_pixels
 from vestcl.io.images import to_pixels
 from vestcl.models._checkpoint import write_checkpoint
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.scoring import GEOMETRIC, ORACLE, OTHER_CAMERA
 
 SIZE = 48, 160
@@ -295,3 +298,19 @@ def test_windows_of_long_clips_are_kept_in_parts(tmp_path: Path) -> None:
     parts = evaluate_windows.plan(sources, protocol, steps, 1, tmp_path, "key")
     assert [len(part.indices) for part in parts] == [PART_WINDOWS, frames - 1 - steps - PART_WINDOWS]
     assert [index for part in parts for index in part.indices] == list(range(1, frames - steps))
+
+
+def test_st_lpips_and_the_peer_come_by_file(tmp_path: Path) -> None:
+    torch.save(public_state(), tmp_path / "st.pth")
+    VoxelFlowNetwork(blocks=[(4, 8), (1, 4)]).save(tmp_path / "flow.safetensors")
+    settings = {**STREETS, "seeds": (3, 3), "steps": 1, "horizons": (1,), "sheets": False, "out": tmp_path / "out"}
+    told = run(**settings, st_lpips=tmp_path / "st.pth", peer=tmp_path / "flow.safetensors")
+    assert set(told["weights"]) == {"peer", "st_lpips"} and "peer" not in told["settings"]
+    assert set(told["summary"]["source"]) == {REPEAT, FLOW, GEOMETRIC, peer.METHOD}
+    assert peer.METHOD in told["summary"]["right"] and peer.METHOD not in told["summary"][CAMERA]
+    assert all(method["by_horizon"]["st_lpips"][0] > 0 for method in told["summary"]["source"].values())
+    (note,) = [line for line in told["notes"] if line.startswith(f"{peer.METHOD} (flow.safetensors): ")]
+    assert note.endswith("with the geometric forecast's depth.")
+    files = list((tmp_path / "out" / "clips").iterdir())
+    run(**settings, peer=tmp_path / "flow.safetensors")
+    assert len(list((tmp_path / "out" / "clips").iterdir())) == len(files) + 1, "other weights, another key"

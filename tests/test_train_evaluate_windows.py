@@ -13,7 +13,7 @@ from st_lpips_weights import public_state
 from train.evaluate_inputs import PAIR, known_of
 from train.evaluate_windows import CAMERA, Setup, forecast, perceptions_of, prepared, presenters, views_of, window
 from train.protocols import NOW, PROTOCOLS
-from vestcl import metrics
+from vestcl import metrics, peer
 from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.forecast import View
@@ -21,6 +21,7 @@ from vestcl.geometric import Perception, forecast_frames
 from vestcl.models.config import configuration
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.trunks import Trunk
+from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.perceptual import LPIPS_SCALING, Lpips, StLpips, squeeze_distance
 from vestcl.scoring import GEOMETRIC, SOURCE, Truth
 from vestcl.views import parse_view
@@ -85,6 +86,21 @@ def test_every_window_tells_how_the_camera_moved() -> None:
     bare = tuple(dataclasses.replace(sample, world_from_cam=None) for sample in clip)
     clip = dataclasses.replace(clip, samples=bare)
     assert not [r for r in window(Perception(clip), Truth(clip, SIZE), 2, setup()) if r.view == CAMERA]
+
+
+def test_the_peer_is_a_baseline_without_a_camera_motion() -> None:
+    clip, flow = street(), VoxelFlowNetwork(blocks=[(4, 8), (1, 4)]).eval()
+    records = window(Perception(clip), Truth(clip, SIZE), 2, setup(peer=flow))
+    own = {record.view: record for record in records if record.method == peer.METHOD}
+    assert set(own) == {SOURCE, "right"}
+    made = peer.forecast_frames(Perception(clip), flow, 2, 1, views_of(clip, setup()))
+    right = clip[3].right
+    assert right is not None
+    for name, truth in ((SOURCE, clip[3].read_image()), ("right", right.read_image())):
+        assert own[name].scores["psnr"] == [pytest.approx(decibels(made.frames[0][name].image, truth), abs=1e-3)]
+    plain = next(record for record in records if (record.view, record.method) == (SOURCE, GEOMETRIC))
+    source_only = forecast(Perception(clip), 2, [SOURCE_VIEW], setup(peer=flow))
+    assert own["right"].seconds > source_only[peer.METHOD].seconds and plain.seconds > 0
 
 
 def test_models_are_charged_for_what_was_seen_before_them() -> None:

@@ -24,10 +24,10 @@ Weight = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Scale = Annotated[float, Field(gt=0, le=1)]
 
-_RULES: Final = ConfigDict(extra="forbid", allow_inf_nan=False)
+RULES: Final = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-@dataclass(frozen=True, config=_RULES)
+@dataclass(frozen=True, config=RULES)
 class DataConfig:
     """What is shown, and how it is varied."""
 
@@ -63,7 +63,7 @@ class DataConfig:
             raise ValueError(f"`frames` must hold three frames or more, first to last, got {list(self.frames)}")
 
 
-@dataclass(frozen=True, config=_RULES)
+@dataclass(frozen=True, config=RULES)
 class OptimiserConfig:
     """Adam, with decoupled weight decay (AdamW) where that is above 0."""
 
@@ -78,7 +78,7 @@ class OptimiserConfig:
     """Where a stage's cosine ends, as a share of the learning rate."""
 
 
-@dataclass(frozen=True, config=_RULES)
+@dataclass(frozen=True, config=RULES)
 class PerceptualConfig:
     """A distance between the features that a classifier has of two images."""
 
@@ -92,7 +92,7 @@ class PerceptualConfig:
             raise ValueError(f'`weights` must be set for `kind` "{self.kind}": loss.perceptual.weights=FILE')
 
 
-@dataclass(frozen=True, config=_RULES)
+@dataclass(frozen=True, config=RULES)
 class PoseConfig:
     """Weights of the ego-motion's error, where the true motion is known; 0 leaves it out."""
 
@@ -102,7 +102,7 @@ class PoseConfig:
     """1 / metre."""
 
 
-@dataclass(frozen=True, config=_RULES)
+@dataclass(frozen=True, config=RULES)
 class LossConfig:
     """Weights of the loss's terms (`train.losses.total_loss`); 0 leaves a term out."""
 
@@ -115,7 +115,7 @@ class LossConfig:
     """Of how far object motion strays from the rigid flow, relative to depth."""
 
 
-@dataclass(frozen=True, config=_RULES)
+@dataclass(frozen=True, config=RULES)
 class Stage:
     """A part of the run: what learns, how fast and how long."""
 
@@ -149,7 +149,7 @@ class Stage:
             raise ValueError(f"`train` must be of encoder and ego_motion where `render` is off, got {list(self.train)}")
 
 
-@dataclass(frozen=True, config=_RULES)
+@dataclass(frozen=True, config=RULES)
 class RunConfig:
     """How the run is carried out: nothing here but ``precision`` and ``on_nan`` changes what is learnt."""
 
@@ -179,7 +179,7 @@ class Position(NamedTuple):
     """Steps of that stage that are done."""
 
 
-@dataclass(frozen=True, config=_RULES)
+@dataclass(frozen=True, config=RULES)
 class Config:
     """A run."""
 
@@ -278,12 +278,12 @@ def from_dict(settings: Mapping[str, Any]) -> Config:
 
 def _checked(settings: Mapping[str, Any], source: str) -> Config:
     try:
-        return _ADAPTER.validate_python(_with_stage_parts(settings))
+        return _ADAPTER.validate_python(with_stage_parts(settings))
     except ValidationError as error:
         raise ValueError(in_words(error, Config, source)) from error
 
 
-def _with_stage_parts(settings: Mapping[str, Any]) -> dict[str, Any]:
+def with_stage_parts(settings: Mapping[str, Any]) -> dict[str, Any]:
     """A stage's ``data`` and ``loss`` say what differs from the run's."""
     stages = settings.get("stages")
     if not isinstance(stages, Sequence) or not all(isinstance(stage, Mapping) for stage in stages):

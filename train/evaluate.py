@@ -32,12 +32,13 @@ from train.evaluate_sheets import write_sheets
 from train.evaluate_windows import PART_WINDOWS, Part, Setup, plan, prepared, read_part, run_part
 from train.protocols import HELD_OUT, NOW_NOTE, PROTOCOLS, Name, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
-from vestcl import __version__, runtime, st_lpips
+from vestcl import __version__, peer, runtime, st_lpips
 from vestcl.bench import _results
 from vestcl.io.atomic import write_bytes
 from vestcl.metrics import MS_SSIM_SIDE
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.trunks import load_trunk
+from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.perceptual import Lpips, StLpips
 from vestcl.prepare_command import shard
 from vestcl.scoring import GEOMETRIC, Record, to_rich
@@ -47,7 +48,19 @@ from vestcl.st_lpips import Option as StLpipsOption
 WIDTH: Final = 200
 
 #: Settings that scores do not depend on, or that stand in the key as the content of files.
-_NOT_IN_KEY: Final = ("model", "squeeze", "lpips", "st_lpips", "out", "shard", "merge", "device", "horizons", "sheets")
+_NOT_IN_KEY: Final = (
+    "model",
+    "squeeze",
+    "lpips",
+    "st_lpips",
+    "peer",
+    "out",
+    "shard",
+    "merge",
+    "device",
+    "horizons",
+    "sheets",
+)
 
 #: Of the scores' files: raised when what a window is given or how it is scored changes.
 _SCORING: Final = 2
@@ -74,6 +87,8 @@ class Evaluation:
     """Weights of AlexNet (torchvision) and of LPIPS's heads (v0.1)."""
     st_lpips: StLpipsOption = None
     """Measure ST-LPIPS, by the weights FILE or those inside an installed stlpips-pytorch."""
+    peer: Path | None = None
+    """Weights of the learned 2D baseline (`python -m train.peer` writes peer.safetensors)."""
     height: int | None = None
     """Pixels; without it the protocol's."""
     width: int | None = None
@@ -197,8 +212,9 @@ def setup_of(config: Evaluation, protocol: Protocol) -> Setup:
     trunk = None if config.squeeze is None else load_trunk("squeezenet1_0", config.squeeze)
     lpips = None if config.lpips is None else Lpips.load("alexnet", *config.lpips)
     shift_tolerant = None if config.st_lpips is None else StLpips.load(config.st_lpips)
+    flow = None if config.peer is None else VoxelFlowNetwork.load(config.peer)
     size, steps = protocol.size, protocol.steps
-    return Setup(protocol, size, steps, models, config.mode, config.stereo, trunk, lpips, shift_tolerant)
+    return Setup(protocol, size, steps, models, config.mode, config.stereo, trunk, lpips, shift_tolerant, flow)
 
 
 def _where(config: Evaluation, protocol: Protocol) -> Where:
@@ -215,7 +231,7 @@ def _about(config: Evaluation, protocol: Protocol) -> dict[str, Any]:
     changed = {"data": None if config.data is None else str(config.data.resolve())}
     effective = {k: getattr(protocol, k) for k in ("size", "steps", "first", "last")}
     weights = {"squeeze": config.squeeze} | dict(zip(("alexnet", "lpips"), config.lpips or (), strict=False))
-    weights["st_lpips"] = None if config.st_lpips is None else st_lpips.find_weights(config.st_lpips)
+    weights |= {"peer": config.peer, "st_lpips": config.st_lpips and st_lpips.find_weights(config.st_lpips)}
     return {
         "vestcl": __version__,
         "settings": settings | changed | effective,
@@ -244,6 +260,8 @@ def _caveats(config: Evaluation, setup: Setup) -> list[str]:
         told.append(f"Without weights, not measured: {', '.join(absent)}.")
     if min(setup.size) < MS_SSIM_SIDE:
         told.append(f"MS-SSIM needs {MS_SSIM_SIDE} pixels a side, got {setup.size[0]} x {setup.size[1]}.")
+    if config.peer is not None:
+        told.append(f"{peer.METHOD} ({config.peer.name}): {peer.ABOUT}")
     default = PROTOCOLS[config.protocol]
     changed = [f"{name} {getattr(protocol, name)}" for name in _PUBLISHED
                if getattr(protocol, name) != getattr(default, name)]  # fmt: skip

@@ -17,13 +17,14 @@ from typing import Final, TypeVar
 
 from train.evaluate_inputs import depths, given, label, label_of, plain
 from train.protocols import NOW, NOW_BORDER, Protocol, Source, currents
-from vestcl import network
+from vestcl import network, peer
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
 from vestcl.geometric import Perception, forecast_frames, show_frame
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.trunks import Trunk
+from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.perceptual import Lpips, StLpips
 from vestcl.scoring import (
     GEOMETRIC,
@@ -74,6 +75,8 @@ class Setup:
     """SqueezeNet 1.0."""
     lpips: Lpips | None = None
     st_lpips: StLpips | None = None
+    peer: VoxelFlowNetwork | None = None
+    """The learned 2D baseline, `vestcl.peer`."""
 
 
 @dataclass(frozen=True)
@@ -213,6 +216,8 @@ def window(perceptions: Perception | Mapping[str, Perception], truth: Truth, ind
     motion = true_motion(clip, index, setup.steps)
     if motion is not None:
         for name, made in forecasts.items():
+            if plain(name) == peer.METHOD:  # images only: it forecasts no motion of the camera
+                continue
             method = CONSTANT_VELOCITY + label_of(name) if plain(name) == GEOMETRIC else name
             errors = ego_errors(made.forecast, motion)
             records.append(Record(clip.name, clip[index].name, index, CAMERA, method, math.nan, errors))
@@ -220,17 +225,22 @@ def window(perceptions: Perception | Mapping[str, Perception], truth: Truth, ind
 
 
 def forecast(perception: Perception, index: int, views: Sequence[View], setup: Setup) -> dict[str, Timed]:
-    """The geometric forecast, then each model's. All use what the first has seen, and are charged for it.
+    """The geometric forecast, then the peer's and each model's. All use what the first has seen, and are charged for
+    it; the peer only where other cameras than the source are asked for, which is all that it needs it for.
 
     Args:
         perception: of the clip.
         index: the current frame t.
         views: cameras.
-        setup: models, mode and steps.
+        setup: models, peer, mode and steps.
     """
     plain_made, whole = _timed(lambda: forecast_frames(perception, index, setup.steps, views))
     looking = max(whole - plain_made.seconds["render"], 0.0)
     made = {GEOMETRIC: Timed(plain_made, whole)}
+    if setup.peer is not None:
+        asked = (perception, setup.peer, index, setup.steps, views)
+        flat, seconds = _timed(functools.partial(peer.forecast_frames, *asked))
+        made[peer.METHOD] = Timed(flat, seconds + ("geometry" in flat.seconds) * looking)
     for name, model in setup.models.items():
         seen = (perception, model, index, setup.steps, views)
         own, seconds = _timed(functools.partial(network.forecast_frames, *seen, mode=setup.mode))

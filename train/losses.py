@@ -78,7 +78,7 @@ def total_loss(
         ValueError: shapes don't fit, or ``perceptual`` is missing.
     """
     rotation, translation = path_errors(step.path_from_cur, batch.path_from_cur, batch.pose_known)
-    terms = {} if view is None else _image_terms(view.image, batch.target, config, perceptual)
+    terms = {} if view is None else image_terms(view.image, batch.target, config, perceptual)
     terms |= {
         "rotation": (config.pose.rotation, rotation),
         "translation": (config.pose.translation, translation),
@@ -184,7 +184,7 @@ def residual_motion(step: Step, batch: Batch) -> torch.Tensor:
     return (strays / depth.clamp(min=NEAREST)).mean()
 
 
-def _image_terms(
+def image_terms(
     image: torch.Tensor, target: torch.Tensor, config: LossConfig, perceptual: Perceptual | None
 ) -> dict[str, tuple[float, torch.Tensor]]:
     """name -> (weight, term), of those that count."""

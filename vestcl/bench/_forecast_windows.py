@@ -10,8 +10,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl import peer
 from vestcl.forecast import Forecast, View
 from vestcl.geometric import Perception, forecast_frames
+from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.scoring import GEOMETRIC, ORACLE, SOURCE, Prediction, Predictions, Record, Timed, Truth, look, score
 from vestcl.scoring import predictions as all_predictions
 from vestcl.scoring.pictures import distance as _distance
@@ -41,6 +43,7 @@ def predict(
     steps: int,
     views: Sequence[View],
     future_from_cur: Sequence[NDArray[np.float64]] | None = None,
+    flow: VoxelFlowNetwork | None = None,
 ) -> tuple[Predictions, Forecast]:
     """All methods on one window.
 
@@ -51,11 +54,17 @@ def predict(
         steps: frames to forecast.
         views: cameras to judge from, each one of the rig's.
         future_from_cur: the true motion of the camera a step, [4, 4] m, for a forecast that is told it.
+        flow: the network of `vestcl.peer`, as a baseline.
 
     Returns:
         The pictures, and the geometric forecast.
     """
     forecasts = _geometric(perception, index, steps, views, future_from_cur)
+    if flow is not None:
+        start, plain = time.perf_counter(), forecasts[GEOMETRIC]
+        made = peer.forecast_frames(perception, flow, index, steps, views)
+        looking = max(plain.seconds - plain.forecast.seconds["render"], 0.0) if "geometry" in made.seconds else 0.0
+        forecasts |= {peer.METHOD: Timed(made, looking + time.perf_counter() - start)}
     return all_predictions(truth, index, steps, views, forecasts), forecasts[GEOMETRIC].forecast
 
 

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from vestcl import metrics, trace
 from vestcl.bench import _timing
-from vestcl.bench._dmvfn import VoxelFlowNetwork
 from vestcl.bench._splatter import counting
 from vestcl.bench._timing import Spread
 from vestcl.bench._traffic import EMPTY, JAM, TRAFFIC, Drive, Window
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.skipping import NOTHING, Count, Skip, count_skips
+from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.scene.layers import build_layers
 from vestcl.stages import watching, with_rest
 

@@ -14,7 +14,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from vestcl import runtime
+from vestcl import peer, runtime
 from vestcl.bench import _forecast_tables as tables
 from vestcl.bench import _forecast_truth as known
 from vestcl.bench import _forecast_windows as windows
@@ -27,6 +27,7 @@ from vestcl.forecast import View
 from vestcl.geometric import Perception
 from vestcl.io.atomic import write_bytes
 from vestcl.models.trunks import Trunk, load_trunk
+from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.perceptual import StLpips
 from vestcl.scoring import SOURCE, Record, Truth
 from vestcl.st_lpips import Option as StLpipsOption
@@ -68,6 +69,8 @@ class ForecastBench:
     """SqueezeNet 1.0 weights, for the distance in its features."""
     st_lpips: StLpipsOption = None
     """Measure ST-LPIPS, by the weights FILE or those inside an installed stlpips-pytorch."""
+    peer: Path | None = None
+    """Weights of the learned 2D baseline (`python -m train.peer` writes peer.safetensors)."""
     pool: bool = False
     """One table over all inputs instead of one for each."""
     street_size: tuple[int, int] = (256, 832)
@@ -91,6 +94,8 @@ class Networks:
     squeeze: Trunk | None = None
     """SqueezeNet 1.0."""
     st_lpips: StLpips | None = None
+    peer: VoxelFlowNetwork | None = None
+    """That forecasts as a baseline."""
 
 
 @dataclass
@@ -124,6 +129,8 @@ def main(config: ForecastBench) -> None:
         console.print("without --squeeze there is no squeeze distance", highlight=False)
     if networks.st_lpips is None:
         console.print("without --st-lpips there is no ST-LPIPS", highlight=False)
+    if networks.peer is not None:
+        console.print(f"{peer.METHOD}: {peer.ABOUT}", highlight=False, soft_wrap=True)
     console.print(f"{machine['device']}, {machine['cores']} cores", highlight=False, soft_wrap=True)
     _write(config, machine, groups, grids, console)
 
@@ -144,6 +151,7 @@ def _networks(config: ForecastBench) -> Networks:
     return Networks(
         None if config.squeeze is None else load_trunk("squeezenet1_0", config.squeeze),
         None if config.st_lpips is None else StLpips.load(config.st_lpips),
+        None if config.peer is None else VoxelFlowNetwork.load(config.peer),
     )
 
 
@@ -220,7 +228,7 @@ def run_clip(
     Args:
         clip: at its own size.
         config: which windows, views and steps.
-        networks: that score.
+        networks: that score, and the baseline.
 
     Returns:
         A window's records, and its facts if there are any.
@@ -234,7 +242,7 @@ def run_clip(
     for index in windows_of(clip, config):
         truth.forget(index - 1)
         motion = known.true_motion(clip, index, config.steps)
-        predictions, forecast = windows.predict(perception, truth, index, config.steps, views, motion)
+        predictions, forecast = windows.predict(perception, truth, index, config.steps, views, motion, networks.peer)
         values = {} if motion is None else known.ego_errors(forecast, motion)
         if known.shot(clip[index]) is not None:
             values |= known.motion_errors(forecast, clip, index, SOURCE) if SOURCE in config.views else {}

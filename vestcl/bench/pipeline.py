@@ -9,11 +9,12 @@ import torch
 from rich.console import Console
 
 from vestcl import pretrained, quality, runtime, trace
-from vestcl.bench import _dmvfn, _pipeline_report, _plots, _results, _timing
+from vestcl.bench import _pipeline_report, _plots, _results, _timing
 from vestcl.bench._pipeline_measure import SceneTimes, measure_scene
 from vestcl.bench._results import Results
 from vestcl.bench._traffic import EMPTY, EVERYTHING, JAM, LEAST_FRAMES, TRAFFIC, drive
 from vestcl.bench.network import peak_gigabytes
+from vestcl.models import voxel_flow
 from vestcl.models.fast import accelerate
 from vestcl.models.forecaster import Forecaster
 
@@ -94,8 +95,8 @@ def load(config: PipelineBench) -> Forecaster:
 def _check(config: PipelineBench) -> None:
     _results.check_positive(config, "height", "width", "seconds", "threads")
     for name in ("height", "width"):
-        if getattr(config, name) % _dmvfn.MULTIPLE:
-            raise ValueError(f"`{name}` must be a multiple of {_dmvfn.MULTIPLE} px, got {getattr(config, name)}")
+        if getattr(config, name) % voxel_flow.MULTIPLE:
+            raise ValueError(f"`{name}` must be a multiple of {voxel_flow.MULTIPLE} px, got {getattr(config, name)}")
     if config.frames < LEAST_FRAMES:
         raise ValueError(f"`frames` must be {LEAST_FRAMES} or more, got {config.frames}")
     if not config.scenes:

@@ -1,27 +1,41 @@
-"""DMVFN's network as a peer for timing: the best known forecast of video from two frames alone, by 2D voxel flow.
+"""DMVFN's network: the best known forecast of video from two frames alone, by 2D voxel flow.
 
 Nine blocks from coarse to fine correct a flow [B, 4, H, W] px, which leads from the next frame back into frames 0 and
 1, and a mask that weighs the two warped frames:
     (dV, dm) = block(I0, I1, warp(I0), warp(I1), m, V),   V += dV,   m += dm,
     next = sigmoid(m) warp(I0) + (1 - sigmoid(m)) warp(I1).
-Facts of the publication (widths, scales, strides, the routing network) are rebuilt here with random weights: what it
-costs does not depend on them.
+Rebuilt from the facts of the publication (widths, scales, strides, the routing network). No public weights of it are
+available: timing needs none, and `python -m train.peer` trains some.
 
 Source: Hu, Huang, Huang, Xu, Zhou, "A Dynamic Multi-Scale Voxel Flow Network for Video Prediction", CVPR 2023;
 github.com/megvii-research/CVPR2023-DMVFN.
 """
 
-from typing import Final
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import nn
 from torch.nn import functional
+
+from vestcl.io import atomic
+from vestcl.models._weights import check_finite, misfit, read_state_dict
 
 #: Of the nine blocks: each sees the frames at 1 / S of their size beside a narrow branch at full size.
 SCALES: Final = (4, 4, 4, 2, 2, 2, 1, 1, 1)
 
 #: Channels of a block by its scale.
 WIDTHS: Final = {4: 160, 2: 80, 1: 44}
+
+#: The same as (scale, width), block by block.
+BLOCKS: Final = tuple((scale, WIDTHS[scale]) for scale in SCALES)
+
+#: The metadata's entry of a file that holds what `VoxelFlowNetwork` was built from.
+KEY: Final = "vestcl.voxel_flow"
 
 #: The coarsest blocks work at 1 / S / 4, and come back by doubling: other sizes would not fit together again.
 MULTIPLE: Final = 16
@@ -62,24 +76,31 @@ class VoxelFlowBlock(nn.Module):
 
 
 class VoxelFlowNetwork(nn.Module):
-    """The next frame from two: 3,559,930 parameters, random ones.
+    """The next frame from two: 3,559,930 parameters, random ones; `load` reads trained ones.
 
     Args:
-        routing: let the routing network draw, for each scene, which blocks run; without it all nine run, which is
-            what the publication calls its network without routing.
+        routing: let the routing network draw, for each scene, which blocks run; without it all run, which is what the
+            publication calls its network without routing.
+        blocks: (scale, width) of each; as published.
+
+    Raises:
+        ValueError: no blocks, or a scale that is not 1, 2 or 4, or a width that is not a multiple of 4.
     """
 
-    def __init__(self, routing: bool = False) -> None:
+    def __init__(self, routing: bool = False, blocks: Sequence[tuple[int, int]] = BLOCKS) -> None:
         super().__init__()
+        if not blocks or not all(scale in WIDTHS and width > 0 and width % 4 == 0 for scale, width in blocks):
+            raise ValueError(f"`blocks` must be pairs of a scale 1, 2 or 4 and a multiple of 4, got {blocks}")
         self.routes = routing
-        self.blocks = nn.ModuleList(VoxelFlowBlock(WIDTHS[scale], scale) for scale in SCALES)
+        self.sizes = tuple((int(scale), int(width)) for scale, width in blocks)
+        self.blocks = nn.ModuleList(VoxelFlowBlock(width, scale) for scale, width in self.sizes)
         self.router = nn.Sequential(
             nn.Conv2d(6, _ROUTING, 3, padding=1),
             nn.ReLU(),
             nn.Conv2d(_ROUTING, _ROUTING, 3, padding=1),
             nn.AdaptiveAvgPool2d(1),
             nn.Flatten(),
-            nn.Linear(_ROUTING, len(SCALES)),
+            nn.Linear(_ROUTING, len(self.sizes)),
         )
 
     def forward(self, first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
@@ -95,8 +116,18 @@ class VoxelFlowNetwork(nn.Module):
         Raises:
             ValueError: frames of another shape.
         """
+        *_, last = self.corrected(first, second)
+        return last
+
+    def corrected(self, first: torch.Tensor, second: torch.Tensor) -> Iterator[torch.Tensor]:
+        """The next frame as it is after each block that runs, the last one being the answer; as `forward`.
+
+        The mean of both frames where routing lets none run.
+        """
         _check(first, second)
         runs = self._draw(first, second)
+        if not runs.any():
+            yield (first + second) / 2
         flow = first.new_zeros(len(first), _FLOW, *first.shape[2:])
         mask, warped = flow[:, :1], (first, second)
         for block, gates in zip(self.blocks, runs.T, strict=True):
@@ -106,13 +137,48 @@ class VoxelFlowNetwork(nn.Module):
             gate = gates.to(flow.dtype)[:, None, None, None]
             flow, mask = flow + gate * flow_change, mask + gate * mask_change
             warped = warp(first, flow[:, :2]), warp(second, flow[:, 2:])
-        weight = mask.sigmoid()
-        return (weight * warped[0] + (1 - weight) * warped[1]).clamp(0, 1)
+            weight = mask.sigmoid()
+            yield (weight * warped[0] + (1 - weight) * warped[1]).clamp(0, 1)
+
+    def save(self, path: Path | str) -> None:
+        """Weights and what the network was built from, in one safetensors file, whole or not at all.
+
+        Raises:
+            ValueError: the folder can't be made.
+        """
+        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.state_dict().items()}
+        built = json.dumps({"routing": self.routes, "blocks": self.sizes})
+        with atomic.replacing(path) as temporary:
+            save_file(tensors, temporary, metadata={KEY: built})
+
+    @classmethod
+    def load(cls, path: Path | str) -> "VoxelFlowNetwork":
+        """What `save` wrote, in evaluation mode.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: a damaged file, one of another network, or weights that are not finite.
+        """
+        path, remedy = Path(path), "`python -m train.peer` writes one"
+        if not path.is_file():
+            raise FileNotFoundError(f"no DMVFN-shaped network at {path}: {remedy}")
+        try:
+            with safe_open(path, framework="pt") as file:
+                built: Any = json.loads((file.metadata() or {})[KEY])
+            network = cls(bool(built["routing"]), [(int(scale), int(width)) for scale, width in built["blocks"]])
+        except (SafetensorError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"`path` must hold a DMVFN-shaped network, got {path} ({error}): {remedy}") from error
+        state = read_state_dict(path)
+        if why := misfit(state, network.state_dict()):
+            raise ValueError(f"`path` must hold the weights of its network; {path} {why}")
+        check_finite(state, path)
+        network.load_state_dict(state)
+        return network.eval()
 
     def _draw(self, first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
         """[B, 9] bool: which blocks run."""
         if not self.routes:
-            return torch.ones(len(first), len(SCALES), dtype=torch.bool, device=first.device)
+            return torch.ones(len(first), len(self.sizes), dtype=torch.bool, device=first.device)
         wishes = self.router(torch.cat([first, second], 1)).sigmoid()
         return torch.bernoulli((_BUDGET * wishes / (wishes.sum(1, keepdim=True) + _TINY)).clamp(0, 1)).bool()
 

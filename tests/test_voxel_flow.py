@@ -1,10 +1,13 @@
-"""vestcl.bench._dmvfn: that the peer is the published network in size and shape, and computes what it should."""
+"""vestcl.models.voxel_flow: that the peer is the published network in size and shape, and computes what it should."""
+
+from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
-from vestcl.bench import _dmvfn
-from vestcl.bench._dmvfn import VoxelFlowBlock, VoxelFlowNetwork, warp
+from vestcl.models import voxel_flow
+from vestcl.models.voxel_flow import KEY, VoxelFlowBlock, VoxelFlowNetwork, warp
 
 
 def frames(batch: int = 1, height: int = 32, width: int = 48) -> tuple[torch.Tensor, torch.Tensor]:
@@ -28,7 +31,7 @@ def test_two_frames_give_a_third(monkeypatch: pytest.MonkeyPatch) -> None:
     network = VoxelFlowNetwork()
     image = network(*frames(2))
     assert image.shape == (2, 3, 32, 48) and image.min() >= 0 and image.max() <= 1
-    assert calls == list(_dmvfn.SCALES)
+    assert calls == list(voxel_flow.SCALES)
     image.sum().backward()
     silent = {name.split(".")[0] for name, p in network.named_parameters() if p.grad is None or not p.grad.any()}
     assert silent == {"router"}
@@ -105,3 +108,47 @@ def test_warp_reads_where_the_flow_points() -> None:
 def test_other_shapes_are_refused(first: tuple[int, ...], second: tuple[int, ...], name: str) -> None:
     with pytest.raises(ValueError, match=rf"`{name}` must be .* got \["):
         VoxelFlowNetwork()(torch.zeros(first), torch.zeros(second))
+
+
+def test_each_block_corrects_the_next_frame_and_the_last_one_is_the_answer() -> None:
+    network, (first, second) = VoxelFlowNetwork(blocks=[(2, 8), (1, 4)]), frames()
+    images = list(network.corrected(first, second))
+    assert len(images) == 2 and not torch.equal(images[0], images[1])
+    assert torch.equal(images[1], network(first, second))
+
+
+def test_a_saved_network_is_the_same(tmp_path: Path) -> None:
+    network, (first, second) = VoxelFlowNetwork(blocks=[(4, 8), (1, 4)]).eval(), frames()
+    network.save(tmp_path / "deep" / "peer.safetensors")
+    loaded = VoxelFlowNetwork.load(tmp_path / "deep" / "peer.safetensors")
+    assert loaded.sizes == ((4, 8), (1, 4)) and not loaded.routes and not loaded.training
+    assert torch.equal(loaded(first, second), network(first, second))
+
+
+def test_files_that_hold_no_such_network(tmp_path: Path) -> None:
+    path = tmp_path / "peer.safetensors"
+    with pytest.raises(FileNotFoundError, match=r"no DMVFN-shaped network at .*: `python -m train.peer` writes one"):
+        VoxelFlowNetwork.load(path)
+    path.write_bytes(b"no weights")
+    with pytest.raises(ValueError, match="`path` must hold a DMVFN-shaped network"):
+        VoxelFlowNetwork.load(path)
+    weights = VoxelFlowNetwork(blocks=[(1, 4)]).state_dict()
+    save_file(weights, path)
+    with pytest.raises(ValueError, match=r"must hold a DMVFN-shaped network, .*voxel_flow"):
+        VoxelFlowNetwork.load(path)
+    built = {KEY: '{"routing": false, "blocks": [[1, 8]]}'}
+    save_file(weights, path, metadata=built)
+    with pytest.raises(ValueError, match="must hold the weights of its network"):
+        VoxelFlowNetwork.load(path)
+    broken = VoxelFlowNetwork(blocks=[(1, 8)])
+    with torch.no_grad():
+        broken.blocks[0].out.bias.fill_(torch.nan)
+    broken.save(path)
+    with pytest.raises(ValueError, match="must hold finite weights, got NaN"):
+        VoxelFlowNetwork.load(path)
+
+
+@pytest.mark.parametrize("blocks", [[], [(3, 8)], [(1, 6)], [(1, 0)]])
+def test_blocks_that_cannot_be(blocks: list[tuple[int, int]]) -> None:
+    with pytest.raises(ValueError, match="`blocks` must be pairs of a scale 1, 2 or 4 and a multiple of 4"):
+        VoxelFlowNetwork(blocks=blocks)
