@@ -1,5 +1,6 @@
 """vestcl.peer: images forecast recursively, and shown from other cameras by their geometry."""
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -99,3 +100,16 @@ def test_it_asks_the_same_of_a_clip_as_the_geometric_forecast() -> None:
     made = peer.forecast_frames(Perception(clip), Stand(lambda a, b: b), 2, 1, views).frames[0]
     wanted = forecast_frames(Perception(clip), 2, 1, views).frames[0]
     assert {k: v.image.shape for k, v in made.items()} == {k: v.image.shape for k, v in wanted.items()}
+
+
+def test_times_go_on_and_a_gap_is_noted() -> None:
+    """Timestamps of a clip, at 10 Hz with a frame lost before t: the forecast frames' go on by its interval."""
+    clip, seconds = street(4), (0.0, 0.1, 0.2, 0.4)
+    samples = tuple(dataclasses.replace(s, timestamp=at) for s, at in zip(clip, seconds, strict=True))
+    clip, network = dataclasses.replace(clip, samples=samples), Stand(lambda a, b: b)
+    views = parse_views(["source", "right"], clip)
+    even, gap = (peer.forecast_frames(Perception(clip), network, index, 1, views) for index in (2, 3))
+    assert even.notes == () and even.frames[0]["right"].image.shape == (3, *SIZE)
+    assert gap.notes == (
+        "frames t-1 and t are 2 intervals apart, which DMVFN shape takes for one: steps may be too long",
+    )

@@ -18,6 +18,7 @@ from vestcl.forecast import Forecast, Rendered, View
 from vestcl.geometric import Perception, show_frame
 from vestcl.geometric import forecast_frames as geometric_frames
 from vestcl.models.voxel_flow import MULTIPLE, VoxelFlowNetwork
+from vestcl.times import is_same
 
 #: The name of this method in tables and files.
 METHOD: Final = "DMVFN shape"
@@ -98,12 +99,19 @@ def forecast_frames(
         shown = _shown(perception, index, images, others)
         seconds["geometry"] = time.perf_counter() - start
     frames = [{view.name: shown[k].get(view.name) or _flat(images[k]) for view in views} for k in range(steps)]
-    return Forecast(METHOD, [], frames, seconds)
+    return Forecast(METHOD, [], frames, seconds, notes=_gap_notes(clip, index))
 
 
 def is_source(view: View, sample: Sample) -> bool:
     """Whether ``view`` is the source camera itself, which sees the network's images as they are."""
     return np.array_equal(view.tgt_from_next, np.eye(4)) and (view.K is None or np.allclose(view.K, sample.K))
+
+
+def _gap_notes(clip: Clip, index: int) -> tuple[str, ...]:
+    elapsed = clip.elapsed(index)
+    if is_same(elapsed, 1.0):
+        return ()
+    return (f"frames t-1 and t are {elapsed:.3g} intervals apart, which {METHOD} takes for one: steps may be too long",)
 
 
 def _shown(
@@ -114,13 +122,16 @@ def _shown(
     geometric = geometric_frames(perception, index, len(images), [source])
     depths = [frame[_SOURCE].depth for frame in geometric.frames]
     pairs = zip(images, depths, strict=True)
-    forecast = [_sample(clip[index], step, *pair) for step, pair in enumerate(pairs, start=1)]
+    forecast = [_sample(clip, index, step, *pair) for step, pair in enumerate(pairs, start=1)]
     seen = Perception(Clip(clip.name, METHOD, (clip[index - 1], clip[index], *forecast)))
     return [show_frame(seen, step, views) for step in range(2, 2 + len(forecast))]
 
 
-def _sample(current: Sample, step: int, image: NDArray[np.float32], depth: NDArray[np.float32]) -> Sample:
-    sample = Sample.from_arrays(f"{current.name}+{step}", image, current.K, depth=depth)
+def _sample(clip: Clip, index: int, step: int, image: NDArray[np.float32], depth: NDArray[np.float32]) -> Sample:
+    """Frame t+k as a reader would give it; ``step`` k is an interval of the clip."""
+    current, interval = clip[index], clip.interval
+    later = None if current.timestamp is None or interval is None else current.timestamp + step * interval
+    sample = Sample.from_arrays(f"{current.name}+{step}", image, current.K, depth=depth, timestamp=later)
     return dataclasses.replace(sample, ego_vehicle=current.ego_vehicle)
 
 
