@@ -75,6 +75,22 @@ def test_exr_channels(tmp_path: Path) -> None:
         io.read_depth(tmp_path / "no.exr")
 
 
+def test_an_npy_file_that_ends_too_early_or_has_a_damaged_header_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, np.ones((20, 30), np.float32))
+    content = path.read_bytes()
+    unclosed = content.replace(b"}", b"(")
+    for damaged in (*(content[:end] for end in range(0, len(content), 37)), content.replace(b"20,", b"2e,"), unclosed):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"a\.npy: is no NPY array, or a damaged one"):
+            io.read_depth(path)
+
+
+def test_a_signalling_nan_is_unknown_and_no_warning(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.array([[0x7FA00000, 0x3F800000]], np.uint32).view(np.float32))
+    assert io.read_depth(tmp_path / "a.npy").tolist() == [[0, 1]]
+
+
 def test_refuses(tmp_path: Path) -> None:
     io.write_pixels(tmp_path / "8.png", picture()[:, :, 0])
     io.write_pixels(tmp_path / "16.png", picture()[:, :, 0].astype(np.uint16))

@@ -89,6 +89,22 @@ def test_refuses_to_write(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_damage_is_found_wherever_it_is_and_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.exr"
+    depth = np.add.outer(np.arange(40.0), np.arange(50.0))
+    io.write_exr(path, {"Z": depth})
+    content = path.read_bytes()
+    for end in range(0, len(content), 31):
+        path.write_bytes(content[:end])
+        with pytest.raises(ValueError, match=r"a\.exr: is no OpenEXR image, or a damaged one"):
+            io.read_exr(path)
+    for position in range(len(content) // 2, len(content), 31):  # in the compressed numbers
+        path.write_bytes(content[:position] + bytes([content[position] ^ 255]) + content[position + 1 :])
+        with pytest.raises(ValueError, match=r"a\.exr: is no OpenEXR image, or a damaged one"):
+            io.read_exr(path)
+    assert capsys.readouterr().out == ""
+
+
 def test_refuses_to_read(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match=r"no\.exr: no such file"):
         io.read_exr(tmp_path / "no.exr")

@@ -1,5 +1,6 @@
 """vestcl.io.images and vestcl.io.atomic."""
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,42 @@ def test_damaged_files_are_named(tmp_path: Path, capfd: pytest.CaptureFixture[st
     with pytest.raises(ValueError, match="Is a directory"):
         io.read_pixels(tmp_path)
     capfd.readouterr()  # libpng grumbles
+
+
+def encoded(image: Image.Image, kind: str, **options: object) -> bytes:
+    buffer = BytesIO()
+    image.save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [("PNG", {}), ("JPEG", {}), ("JPEG", {"progressive": True}), ("JPEG", {"exif": b"Exif\0\0\xff\xd9"})],
+)
+def test_a_file_that_ends_too_early_is_found_wherever_it_ends(
+    tmp_path: Path, kind: str, options: dict[str, object], capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a"
+    content = encoded(Image.fromarray(picture(40, 50)), kind, **options)
+    for end in range(0, len(content), 29):
+        path.write_bytes(content[:end])
+        with pytest.raises(ValueError, match=r"a: is no image, or a damaged one$"):
+            io.read_pixels(path)
+    path.write_bytes(content + b"what a telephone appends")
+    assert io.read_pixels(path).shape == (40, 50, 3)
+    assert capfd.readouterr().out == ""
+
+
+def test_a_byte_that_changed_in_a_png_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    content = bytearray(encoded(Image.fromarray(picture(40, 50)[:, :, 0]), "PNG"))
+    for position in range(0, len(content), 29):
+        content[position] ^= 4
+        path.write_bytes(content)
+        for read in (io.read_pixels, lambda name: io.read_train_ids(name, "labelIds")):
+            with pytest.raises(ValueError, match=r"a\.png: is no image, or a damaged one$"):
+                read(path)
+        content[position] ^= 4
 
 
 def test_refuses(tmp_path: Path) -> None:

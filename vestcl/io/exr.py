@@ -6,7 +6,10 @@ Colour follows OpenEXR's custom: linear light, Rec. 709 primaries. Ours is displ
 reading undoes it. It is not multiplied by `A`.
 """
 
-from collections.abc import Mapping
+import io
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -91,7 +94,7 @@ def read_exr(path: str | Path) -> dict[str, NDArray[np.generic]]:
     content = read_bytes(path)
     _check_claims(path, content)
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with _silent(), OpenEXR.File(str(path), separate_channels=True) as file:
             header = dict(file.header())
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # the library raises what its file's damage leads it to
@@ -170,6 +173,20 @@ def _check_claims(path: str | Path, content: bytes) -> None:
         check_chunks(content, part)
     except ValueError as error:
         raise ValueError(f"{path}: is no OpenEXR image, or a damaged one ({error})") from error
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep what OpenEXR 3.4 prints about a damaged file out of standard output.
+
+    Other threads let it print: two that redirect `sys.stdout` at once would restore it in the wrong order.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    with redirect_stdout(io.StringIO()) as printed:
+        yield
+    print(printed.getvalue(), end="")  # another thread's, where no error came
 
 
 def _storable(array: NDArray[np.generic]) -> NDArray[np.generic]:
