@@ -22,7 +22,7 @@ from typing import Any, Final
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from train import evaluate_report as report
 from train.command import ERRORS, failed
@@ -41,6 +41,7 @@ from vestcl.models.trunks import load_trunk
 from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.perceptual import Lpips, StLpips
 from vestcl.prepare_command import shard
+from vestcl.progress import Bar
 from vestcl.scoring import GEOMETRIC, Record, to_rich
 from vestcl.st_lpips import Option as StLpipsOption
 
@@ -276,7 +277,7 @@ def _caveats(config: Evaluation, setup: Setup) -> list[str]:
 
 def _run(parts: Sequence[Part], setup: Setup, console: Console) -> None:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal)
+    bar = Bar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal)
     with bar:
         task = bar.add_task("windows", total=sum(len(part.indices) for part in parts))
         for part in parts:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
 from train.config import Config
@@ -19,6 +19,7 @@ from vestcl import sheet
 from vestcl.io.atomic import write_bytes
 from vestcl.io.images import write_pixels
 from vestcl.models.forecaster import RenderedView
+from vestcl.progress import Bar
 
 LOG: Final = "log.jsonl"
 
@@ -63,7 +64,7 @@ class Reporter:
         """A bar from ``step`` to the run's end."""
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         drawn = self._speaks and self.console.is_terminal
-        with Progress(*columns, TimeRemainingColumn(), console=self.console, disable=not drawn) as self._bar:
+        with Bar(*columns, TimeRemainingColumn(), console=self.console, disable=not drawn) as self._bar:
             self._task = self._bar.add_task("", total=self._config.steps, completed=step)
             try:
                 yield

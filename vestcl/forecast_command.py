@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -23,6 +23,7 @@ from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Skipped, View
 from vestcl.models.trunks import load_trunk
 from vestcl.perceptual import StLpips
+from vestcl.progress import Bar
 from vestcl.views import parse_views
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ _BESIDE: Final = {"depth": None, "depth_scale": None, "labels": None, "label_ids
 class _Stages:
     """The bar on the terminal, and how long each stage took."""
 
-    bar: Progress
+    bar: Bar
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -82,7 +83,7 @@ def run(options: "cli.Forecast") -> None:
     _check(options)
     console = Console()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    bar = Bar(*columns, console=console, transient=True, disable=not console.is_terminal)
     with runtime.use(options.device), bar:
         stages = _Stages(bar)
         with stages.stage("open the clip"):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from vestcl.data.sample import Clip
@@ -20,6 +20,7 @@ from vestcl.data.street_drive import Sway
 from vestcl.forecast_command import open_clip
 from vestcl.prepare_clip import Outcome, Report, prepare_clip
 from vestcl.prepare_workers import Task, Told, run_tasks
+from vestcl.progress import Bar
 
 if TYPE_CHECKING:
     from vestcl import cli
@@ -59,7 +60,7 @@ def run(options: "cli.Prepare") -> None:
     console = Console()
     hidden = not console.is_terminal or os.environ.get("LOCAL_RANK", "0") != "0"  # one bar a terminal
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden)
+    bar = Bar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden)
     told = Told()
     with bar:
         shown = bar.add_task("frames", total=sum(task.frames for task in tasks))

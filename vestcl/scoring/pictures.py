@@ -264,7 +264,7 @@ def _looks(pictures: Iterable[NDArray[np.float32]], known: Mapping[int, Look], t
 
 def _scores(looks: Sequence[Look], wanted: Look, seen: torch.Tensor, truth: Truth) -> dict[str, torch.Tensor]:
     """Of M pictures, all metrics that the size allows, [M] each."""
-    pictures, lpips = torch.cat([each.picture for each in looks]), truth.lpips
+    pictures = torch.cat([each.picture for each in looks])
     target = wanted.picture.expand_as(pictures)
     side = min(pictures.shape[2:])
     scores = {"psnr": metrics.psnr(pictures, target)}
