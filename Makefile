@@ -2,9 +2,10 @@
 SHELL := /bin/bash
 PYTHON ?= python3
 BIN := .venv/bin
+LOWEST := .venv-lowest
 OUT ?= out
 
-.PHONY: venv demo test lint bench stress oclgrind devices-test clean
+.PHONY: venv demo test lint test-lowest bench stress oclgrind devices-test clean
 
 venv: .venv/.installed
 
@@ -25,6 +26,17 @@ lint: venv
 
 test: lint
 	$(BIN)/pytest -q
+
+# The tests with the lowest versions that setup.py admits, on Python 3.10 or 3.11; torch is the same as in .venv.
+test-lowest: $(LOWEST)/.installed
+	$(LOWEST)/bin/pytest -q
+
+$(LOWEST)/.installed: setup.py constraints.txt tests/lowest_versions.py
+	$(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --constraint constraints.txt setuptools torch
+	$(LOWEST)/bin/python tests/lowest_versions.py > $(LOWEST)/requirements.txt
+	$(LOWEST)/bin/python -m pip install --no-build-isolation --requirement $(LOWEST)/requirements.txt --editable .
+	touch $@
 
 bench: venv
 	$(BIN)/vestcl bench splat
@@ -50,5 +62,5 @@ oclgrind: venv
 	$(BIN)/python tests/oclgrind_scenes.py
 
 clean:
-	rm -rf .venv build dist ./*.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	rm -rf .venv $(LOWEST) build dist ./*.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -3,7 +3,7 @@
 from setuptools import find_packages, setup
 
 #: Of train/, which is not part of the package.
-TRAIN = ["pydantic>=2.7", "PyYAML>=6", "tensorboard>=2.16"]
+TRAIN = ["pydantic>=2.7", "PyYAML>=6", "tensorboard>=2.16.2"]
 
 setup(
     name="vestcl",
@@ -20,16 +20,16 @@ setup(
         "av>=18",
         "matplotlib>=3.8",
         "numpy>=1.26",
-        "opencv-contrib-python-headless>=4.10",
+        "opencv-contrib-python-headless>=4.10.0.82",
         "OpenEXR>=3.3",
-        "pillow>=10",
-        "pyopencl[pocl]>=2024.2",
+        "pillow>=10.1",  # load_default(size)
+        "pyopencl[pocl]>=2024.2.7",  # older ones warn with current pytools
         "rich>=13",
-        "safetensors>=0.4",
+        "safetensors>=0.4.3",
         "scikit-image>=0.24",
-        "scipy>=1.11",
+        "scipy>=1.11.1",  # 1.11.0 was withdrawn
         "torch>=2.4",
-        "tyro>=0.9",
+        "tyro>=1.0",  # older ones take the value of `--view -0.5,0,0` for an option, and want two subcommands
     ],
     extras_require={
         "dev": [
@@ -44,7 +44,7 @@ setup(
             "setuptools>=77",
             "types-PyYAML>=6",
         ],
-        "estimators": ["transformers>=4.57"],
+        "estimators": ["transformers>=4.57.1"],
         "intel": ["intel-cmplr-lib-rt", "intel-opencl-rt"],
         "train": TRAIN,
     },

@@ -10,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from lowest_versions import lowest_versions
 
 from vestcl import __version__
 
@@ -82,6 +83,14 @@ def test_the_wheel_holds_every_kernel_and_module_and_nothing_else(wheel: Path, c
 
 def test_both_versions_are_one(wheel: Path) -> None:
     assert wheel.name == f"vestcl-{__version__}-py3-none-any.whl"
+
+
+def test_every_dependency_has_a_lowest_version_that_can_be_installed() -> None:
+    lowest = lowest_versions()
+    floors = [requirement for requirement in lowest if "==" in requirement]
+    assert {"numpy", "pyopencl[pocl]", "tyro", "pydantic", "transformers"} <= {floor.split("==")[0] for floor in floors}
+    assert not [requirement for requirement in lowest if requirement.startswith("torch")]
+    assert [requirement for requirement in lowest if requirement.startswith("pytest>=")]
 
 
 def test_kernels_build_from_a_wheel(wheel: Path, tmp_path: Path) -> None:
