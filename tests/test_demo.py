@@ -16,8 +16,6 @@ from vestcl.views import parse_view
 
 @pytest.mark.parametrize("model", ["geometric", "vest-s"])
 def test_does_the_whole_job(model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    if model not in ("geometric", *pretrained.shipped()):
-        pytest.skip(f"no trained {model} has been put into vestcl/weights yet")
     out = tmp_path / "new" / "folder"
     demo.run(out, height=96, width=312, seed=4, model=model, steps=3)
     said = capsys.readouterr().out.replace("\n", "")

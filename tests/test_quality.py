@@ -51,7 +51,9 @@ def test_the_shipped_network_keeps_the_bound(level: Quality, scenes: list[Scene]
 
 
 def test_the_committed_figures_keep_the_bound() -> None:
-    for result in load(FIGURES):
+    results = load(FIGURES)
+    assert results
+    for result in results:
         together = result.details["front"]
         points = {point["value"]: point for point in together["points"]}
         seconds = []

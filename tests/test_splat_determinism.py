@@ -88,16 +88,19 @@ def test_whatever_memory_held_before(
 
     def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         array = plain(shape, dtype)
+        filled.append(array.nbytes)
         array.reshape(-1).view(np.uint8).fill(pattern)
         return array
 
     def scratch(job: runtime.Job, count: int, dtype: Any) -> runtime.Buffer:
+        scratches.append(count)
         return job.write(empty((max(1, count) * np.dtype(dtype).itemsize,), np.uint8))
 
-    usual = bits(5), bits(16)
+    usual, filled, scratches = (bits(5), bits(16)), [], []
     monkeypatch.setattr(runtime.Job, "scratch", scratch)
     monkeypatch.setattr(host_memory, "empty", empty)
     assert (bits(5), bits(16)) == usual
+    assert len(filled) > 10 and scratches
 
 
 @pytest.mark.parametrize("name", ["z", *INPUTS])
