@@ -17,7 +17,7 @@ setup(
     package_dir={"vestcl.kernels": "kernels"},
     package_data={"vestcl": ["weights/*.safetensors"], "vestcl.kernels": ["*.cl", "*.h"]},
     install_requires=[
-        "av>=18",
+        "av>=17.1",  # the newest for Python 3.10
         "matplotlib>=3.8",
         "numpy>=1.26",
         "opencv-contrib-python-headless>=4.10.0.82",
