@@ -65,6 +65,7 @@ ABLATIONS = {
     "residual": change(refine=dataclasses.replace(TINY.refine, base="splatted")),
     "filled": change(render=RenderConfig(normalised=True), refine=dataclasses.replace(TINY.refine, base="filled")),
     "routing": change(object_motion=dataclasses.replace(OBJECTS, routing=RoutingConfig(4, budget=1.0))),
+    "inpainted": change(object_motion=dataclasses.replace(OBJECTS, inpainted=True)),
     "paper": change(object_motion=dataclasses.replace(OBJECTS, shape="paper")),
 }
 

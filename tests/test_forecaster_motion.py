@@ -99,8 +99,11 @@ def test_object_motion_never_sees_the_skys_flow() -> None:
 
 
 def test_fixed_depth_reaches_everything() -> None:
-    encoded = Forecaster(ABLATIONS["fixed depth"]).encode(frame(1, 32, 48))
-    assert encoded.layers.depth.unique().tolist() == encoded.layers.background_depth.unique().tolist() == [FIXED_DEPTH]
+    """And the background stays 1 % behind what hides it."""
+    layers = frame(1, 32, 48)
+    seen = Forecaster(ABLATIONS["fixed depth"]).encode(layers).layers
+    assert seen.depth.unique().tolist() == [FIXED_DEPTH]
+    assert torch.equal(seen.background_depth, torch.where(layers.mask == 0, 1.01 * FIXED_DEPTH, FIXED_DEPTH))
 
 
 def test_the_grid_by_hand() -> None:

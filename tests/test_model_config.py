@@ -33,22 +33,28 @@ def test_the_paper() -> None:
     assert config.encoder.features == 32
     assert config.object_motion is not None and config.object_motion.shape == "paper"
     assert config.object_motion.routing is None and config.fixed_depth is None
-    assert config.render.side_channels(32) == 37 and config.render.channels(32) == 74
+    assert config.render.side_channels(32) == 32 and config.render.channels(32) == 64
     assert not config.render.joint and config.refine.base == "none"
+    assert config.start == "rest" and config.default_mode == "feedback" and not config.object_motion.inpainted
+    assert configuration("vest-paper+colour").render.channels(32) == 74
 
 
 def test_every_variant_changes_its_own_field() -> None:
     changed: dict[str, Callable[[ModelConfig], Any]] = {
-        "fixed-depth": lambda c: c.fixed_depth == 20.0,
+        "fixed-depth": lambda c: c.fixed_depth == 20.0 and c.object_motion.where == "everywhere",
         "no-emf": lambda c: c.ego_motion is None and c.object_motion.where == "everywhere",
         "no-omf": lambda c: c.object_motion is None,
+        "colour": lambda c: c.render.side_channels(32) == 37,
         "features-only": lambda c: not c.render.colour and c.render.channels(32) == 64,
-        "joint": lambda c: c.render.joint and c.render.channels(32) == 37,
-        "residual": lambda c: c.refine.base == "splatted" and not c.render.normalised,
-        "filled": lambda c: c.refine.base == "filled" and c.render.normalised,
+        "joint": lambda c: c.render.joint and c.render.channels(32) == c.render.side_channels(32),
+        "residual": lambda c: c.refine.base == "splatted" and c.render.colour and not c.render.normalised,
+        "filled": lambda c: c.refine.base == "filled" and c.render.colour and c.render.normalised,
         "painting": lambda c: c.refine.base == "none" and not c.render.normalised,
         "from-rest": lambda c: c.start == "rest",
         "from-prior": lambda c: c.start == "prior",
+        "feedback": lambda c: c.default_mode == "feedback",
+        "compose": lambda c: c.default_mode == "compose",
+        "omf-inpainted": lambda c: c.object_motion is not None and c.object_motion.inpainted,
         "omf-paper": lambda c: c.object_motion is not None and c.object_motion.shape == "paper",
         "omf-dmvfn": lambda c: c.object_motion is not None and c.object_motion.shape == "dmvfn",
         "routing": lambda c: c.object_motion is not None and c.object_motion.routing == RoutingConfig(budget=4.5),
@@ -63,6 +69,8 @@ def test_every_variant_changes_its_own_field() -> None:
             }
             if variant == "from-rest":  # and no further than the next frame
                 assert different <= {"name", "start", "ego_motion"}
+            elif variant == "fixed-depth":  # object motion corrects all
+                assert different <= {"name", "fixed_depth", "object_motion"}
             elif variant == "no-emf":  # object motion moves all
                 assert different <= {"name", "ego_motion", "object_motion"}
             elif variant in ("features-only", "residual", "filled", "painting"):  # what is rendered, what is added to
@@ -81,6 +89,22 @@ def test_a_path_needs_a_prior() -> None:
         "vest-paper": 1, "vest-s": 5, "vest-s+from-rest": 1, "vest-s+from-prior": 5, "vest-paper+from-prior": 1,
     }  # fmt: skip
     assert configuration("vest-s+no-emf+from-rest").ego_motion is None
+
+
+def test_later_frames_are_forecast_recursively_by_models_that_start_from_rest() -> None:
+    """As the paper does; from a prior motion is composed. Variants say otherwise, wherever they are in the name."""
+    modes = {
+        "vest-paper": "feedback", "vest-s": "compose", "vest-s+from-rest": "feedback",
+        "vest-paper+from-prior": "compose", "vest-paper+compose": "compose", "vest-s+feedback": "feedback",
+        "vest-s+compose+from-rest": "compose", "vest-s+from-rest+no-emf": "feedback",
+    }  # fmt: skip
+    assert {name: configuration(name).default_mode for name in modes} == modes
+    assert ModelConfig("mine").default_mode == "feedback" and ModelConfig("mine", start="prior").mode is None
+
+
+def test_the_fixed_depth_is_to_be_searched() -> None:
+    for name, metres in (("vest-s+fixed-depth=35", 35.0), ("vest-paper+fixed-depth=7.5+no-omf", 7.5)):
+        assert configuration(name).fixed_depth == metres and configuration(name).name == name
 
 
 def test_variants_add_up() -> None:
@@ -104,7 +128,9 @@ def test_the_parts_of_a_model_fit(name: str) -> None:
         assert len(motion.later) == config.ego_motion.path - 1
     if config.object_motion:
         network = ObjectMotion(config.object_motion, channels)
-        assert network(features, features, depth, depth, mask, mask, torch.rand(1, 6, 4, 8)).flow.shape == (1, 6, 4, 8)
+        behind = [features, features, depth, depth] if config.object_motion.inpainted else []
+        seen = features, features, depth, depth, mask, mask, torch.rand(1, 6, 4, 8)
+        assert network(*seen, backgrounds=behind).flow.shape == (1, 6, 4, 8)
     refine = Refine(config.refine, config.render, channels)
     assert refine(torch.rand(1, config.render.channels(channels), 16, 32)).shape == (1, 3, 16, 32)
 
@@ -124,6 +150,11 @@ def test_frozen_and_hashable() -> None:
         (lambda: configuration("vest-s+"), r"got '\+'"),
         (lambda: configuration("vest-s+no-omf+routing"), "'vest-s' has no object motion to change"),
         (lambda: configuration("vest-s+features-only+residual"), r"needs `render.colour`"),
+        (lambda: configuration("vest-paper+features-only+colour"), r"not have both \+colour, .* and \+features-only"),
+        (lambda: configuration("vest-s+fixed-depth=far"), r"'\+fixed-depth=far': could not convert"),
+        (lambda: configuration("vest-s+fixed-depth=nan"), r"`fixed_depth` must be in \[0.1, 1000.0\] m, got nan"),
+        (lambda: configuration("vest-s+joint=3"), r"`name` may give \+fixed-depth a number, got '\+joint=3'"),
+        (lambda: ModelConfig("mine", mode="dream"), '`mode` must be "feedback", "compose" or None, got \'dream\''),  # type: ignore[arg-type]
         (lambda: EgoMotionConfig(heads=3), r"`widths\[-1\]` must be a multiple of 4 `heads` = 12, got 256"),
         (lambda: EgoMotionConfig(path=0), "`path` must be 1 or more, got 0"),
         (

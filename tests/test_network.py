@@ -1,6 +1,8 @@
 """vestcl.network: forecasts by a network, asked for and answered as the geometric ones are."""
 
+import dataclasses
 import functools
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,9 +14,9 @@ from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Skipped, View
 from vestcl.geometric import Perception
-from vestcl.models.forecaster import Forecaster
+from vestcl.models.forecaster import Forecaster, perceive_estimated
 from vestcl.models.skipping import Count, Tally
-from vestcl.network import forecast_clip, forecast_frames, what_was_skipped
+from vestcl.network import forecast_clip, forecast_frames, show_frame, what_was_skipped
 from vestcl.network_input import last_motions, network_input
 from vestcl.prepared import prepare_frame
 from vestcl.stages import REST, STAGES
@@ -46,6 +48,48 @@ def assert_same(got: Forecast, wanted: Forecast) -> None:
         for name in one:
             for part in ("image", "depth", "coverage", "motion_xyz"):
                 assert np.array_equal(getattr(one[name], part), getattr(other[name], part))
+
+
+def test_the_recording_car_is_left_out_of_ego_motion() -> None:
+    """In forecasts and in the present, as the clip's samples know it."""
+    bonnet = np.zeros((1, HEIGHT, WIDTH), bool)
+    bonnet[:, -20:] = True
+    riding = SimpleNamespace(read=lambda: bonnet)
+    samples = tuple(dataclasses.replace(sample, ego_vehicle=riding) for sample in clip())
+    given, network, seen = Perception(dataclasses.replace(clip(), samples=samples)), model("rest"), []
+    original = network.move_camera
+
+    def move_camera(*arguments: Any) -> Any:
+        seen.append(arguments[3])
+        return original(*arguments)
+
+    network.move_camera = move_camera  # type: ignore[method-assign]
+    forecast_frames(given, network, 2, 2, VIEWS)
+    show_frame(given, network, 2, VIEWS)
+    assert len(seen) == 3  # two steps of recursion, and the present
+    assert all(np.array_equal(own[0].numpy(), bonnet) for own in seen)
+
+
+def test_the_default_mode_is_the_models() -> None:
+    for start, mode in (("prior", "compose"), ("rest", "feedback")):
+        assert_same(
+            forecast_frames(perception(), model(start), 2, 3, VIEWS),
+            forecast_frames(perception(), model(start), 2, 3, VIEWS, mode=mode),  # type: ignore[arg-type]
+        )
+
+
+def test_recursion_sees_what_it_is_given() -> None:
+    """An estimator of depth runs on the forecast frame, once per step that follows."""
+    seen = []
+
+    def depth(image: np.ndarray) -> np.ndarray:
+        seen.append(image)
+        return np.full_like(image[:1], 12.0)
+
+    made = forecast_frames(perception(), model("rest"), 2, 3, VIEWS[:1], perceive=perceive_estimated(depth))
+    assert [image.shape for image in seen] == [(3, HEIGHT, WIDTH)] * 2
+    for image, frame in zip(seen, made.frames, strict=False):
+        assert np.array_equal(image, frame["source"].image)
 
 
 @pytest.mark.parametrize("mode", ["compose", "feedback"])

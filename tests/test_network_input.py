@@ -68,6 +68,15 @@ def test_layers_and_camera_are_those_of_the_frames() -> None:
     assert np.array_equal(got.prior.velocity_cur[0], cur.velocity)
 
 
+def test_the_recording_car_is_where_either_frame_has_it() -> None:
+    frames = prepared(0, None, own=True), prepared(1, MOTIONS[0])
+    for prev, cur in (frames, frames[::-1]):
+        cur = dataclasses.replace(cur, prev_from_cur=np.linalg.inv(MOTIONS[0]))
+        own = network_input(prev, cur, last_motions(cur)).own
+        assert own is not None and own.dtype == torch.float32 and own.shape == (1, 1, HEIGHT, WIDTH)
+        assert own[:, :, -2:].all() and not own[:, :, :-2].any()
+
+
 def test_input_has_memory_of_its_own() -> None:
     prev, cur = prepared(0, None), prepared(1, MOTIONS[0])
     got, kept = network_input(prev, cur, last_motions(prev, cur)), cur.velocity.copy()

@@ -25,9 +25,10 @@ def small(render: RenderConfig | None = None, base: Any = "none") -> Refine:
 @pytest.mark.parametrize(
     ("name", "channels", "count"),
     [
-        ("vest-paper", 74, 18_950_006),
+        ("vest-paper", 64, 18_934_326),
         ("vest-paper+features-only", 64, 18_934_326),
-        ("vest-paper+joint", 37, 18_891_990),
+        ("vest-paper+colour", 74, 18_950_006),
+        ("vest-paper+colour+joint", 37, 18_891_990),
     ],
 )
 def test_number_of_parameters(name: str, channels: int, count: int) -> None:

@@ -6,6 +6,9 @@ from typing import Final
 #: behind it 1/z stays well inside float32.
 NEAR: Final = 0.1
 
+#: By how much what an object hides is farther than the object, at least (SPEC section 3.3).
+BEHIND: Final = 1.01
+
 #: Side of a square tile in pixels. A point of up to TILE / 2 = 8 px radius (the adaptive radius' upper
 #: clamp) then touches at most 2 x 2 tiles, and 16 x 16 x 32 float32 accumulators fit a 48 KiB L1 cache.
 TILE: Final = 16

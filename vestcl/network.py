@@ -12,7 +12,7 @@ from vestcl.forecast import Forecast, Rendered, Skipped, View
 from vestcl.geometric.forecast import gap_notes
 from vestcl.geometric.perception import Perception
 from vestcl.models.config import ModelConfig
-from vestcl.models.forecaster import Forecaster, Mode, RenderedView
+from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
 from vestcl.models.skipping import Count, Tally, count_skips
 from vestcl.network_input import NetworkInput, last_motions, network_input
 from vestcl.prepared import prepare_frame
@@ -32,7 +32,8 @@ def forecast_clip(
     views: Sequence[View],
     model: Forecaster,
     *,
-    mode: Mode = "compose",
+    mode: Mode | None = None,
+    perceive: Perceive | None = None,
     progress: Progress | None = None,
 ) -> Forecast:
     """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` alone.
@@ -43,7 +44,8 @@ def forecast_clip(
         steps: frames to forecast, 1 or more.
         views: cameras to show each from.
         model: a trained network, see `Forecaster.load`.
-        mode: how steps after the first are made, see `Forecaster.forecast`.
+        mode: how steps after the first are made, see `Forecaster.forecast`; None is the model's default.
+        perceive: how forecast frames become inputs of mode "feedback", see `Forecaster.forecast`.
         progress: called with the stage and the share of the work that is done.
 
     Returns:
@@ -59,7 +61,8 @@ def forecast_clip(
             progress(stage, min(done[0] / _STAGES, 1.0))
         done[0] += 1
 
-    return forecast_frames(Perception(clip, tell), model, index, steps, views, mode=mode, tell=tell)
+    perception = Perception(clip, tell)
+    return forecast_frames(perception, model, index, steps, views, mode=mode, perceive=perceive, tell=tell)
 
 
 def forecast_frames(
@@ -69,7 +72,8 @@ def forecast_frames(
     steps: int,
     views: Sequence[View],
     *,
-    mode: Mode = "compose",
+    mode: Mode | None = None,
+    perceive: Perceive | None = None,
     tell: Callable[[str], None] = lambda stage: None,
 ) -> Forecast:
     """`forecast_clip` on a `Perception` that may have seen earlier frames already, and keeps what it sees.
@@ -80,7 +84,8 @@ def forecast_frames(
         index: the current frame t.
         steps: frames to forecast.
         views: cameras to show each from.
-        mode: see `Forecaster.forecast`.
+        mode: see `forecast_clip`.
+        perceive: see `forecast_clip`.
         tell: called with the stage before the networks run.
 
     Raises:
@@ -96,8 +101,8 @@ def forecast_frames(
     start = time.perf_counter()
     with torch.inference_mode(), watching() as watch, count_skips() as tally:
         done = model.forecast(
-            given.frame_prev, given.frame_cur, given.K, steps, cameras(views, given), mode,
-            prior=given.prior if model.config.start == "prior" else None,
+            given.frame_prev, given.frame_cur, given.K, steps, cameras(views, given), mode, perceive,
+            prior=given.prior if model.config.start == "prior" else None, own=given.own,
         )  # fmt: skip
     names = [view.name for view in views]
     frames = [dict(zip(names, map(_rendered, step.views), strict=True)) for step in done]
@@ -146,7 +151,7 @@ def show_frame(perception: Perception, model: Forecaster, index: int, views: Seq
     given, _ = _given(perception, index, model.config)
     prior = given.prior if model.config.start == "prior" else None
     with torch.inference_mode():
-        shown = model.present(given.frame_prev, given.frame_cur, given.K, cameras(views, given), prior)
+        shown = model.present(given.frame_prev, given.frame_cur, given.K, cameras(views, given), prior, given.own)
     return dict(zip((view.name for view in views), map(_rendered, shown), strict=True))
 
 

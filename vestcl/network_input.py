@@ -28,6 +28,8 @@ class NetworkInput(NamedTuple):
     """[1, 3, 3] px, of both."""
     prior: MotionPrior
     """Where the networks start from."""
+    own: torch.Tensor | None = None
+    """[1, 1, H, W], 1 where the recording car itself is in either image; None is nowhere."""
 
 
 def network_input(prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.float64]]) -> NetworkInput:
@@ -72,7 +74,8 @@ def network_input(prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.fl
         torch.tensor([1 + cur.elapsed]),
         torch.tensor([True]),
     )
-    return NetworkInput(batch([prev.layers]), batch([cur.layers]), torch.from_numpy(cur.K[None]).float(), prior)
+    own = torch.from_numpy((prev.own | cur.own)[None]).float()
+    return NetworkInput(batch([prev.layers]), batch([cur.layers]), torch.from_numpy(cur.K[None]).float(), prior, own)
 
 
 def last_motions(*frames: Prepared) -> list[NDArray[np.float64]]:

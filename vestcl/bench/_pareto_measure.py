@@ -43,11 +43,12 @@ class Bench:
         self.references = [step(exact, double(scene.given)).clamp(0, 1) for scene in self.scenes]
 
 
-def step(model: Forecaster, given: NetworkInput, steps: int = 1, mode: Mode = "compose") -> torch.Tensor:
+def step(model: Forecaster, given: NetworkInput, steps: int = 1, mode: Mode | None = None) -> torch.Tensor:
     """The frame at t + ``steps`` as the source camera sees it, [1, 3, H, W]."""
     prior = given.prior if model.config.start == "prior" else None
     with torch.no_grad():
-        done = model.forecast(given.frame_prev, given.frame_cur, given.K, steps, mode=mode, prior=prior, shown=(steps,))
+        known = {"mode": mode, "prior": prior, "own": given.own, "shown": (steps,)}
+        done = model.forecast(given.frame_prev, given.frame_cur, given.K, steps, **known)  # type: ignore[arg-type]
     return done[-1].views[0].image
 
 

@@ -81,7 +81,8 @@ def shrunk(given: NetworkInput, scale: float) -> NetworkInput:
     prior = given.prior._replace(
         velocity_prev=picked(given.prior.velocity_prev), velocity_cur=picked(given.prior.velocity_cur)
     )
-    return NetworkInput(frame(given.frame_prev), frame(given.frame_cur), K, prior)
+    own = None if given.own is None else picked(given.own)
+    return NetworkInput(frame(given.frame_prev), frame(given.frame_cur), K, prior, own)
 
 
 def full(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:

@@ -128,7 +128,7 @@ class Stepper:
         views = [(window.tgt_from_next, given.K)] * (2 if self.variant.twice else 1)
         start = time.perf_counter()
         with trace.stage(self.variant.name), watching() as watch:
-            done = self._model.forecast(*window.frames, given.K, 1, views, prior=prior)
+            done = self._model.forecast(*window.frames, given.K, 1, views, prior=prior, own=given.own)
         self.stages.append(with_rest(watch.seconds, time.perf_counter() - start))
         return done[0].views[0].image
 

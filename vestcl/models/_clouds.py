@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch.nn import functional
 
-from vestcl import geometry
+from vestcl import constants, geometry
 from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
 from vestcl.models.ego_motion import RigidMotion
 from vestcl.ops.rigid_flow import rigid_flow
@@ -103,16 +103,27 @@ def lift(
     )
 
 
-def lift_hidden(frame: EncodedFrame, to_next: RigidMotion, K: torch.Tensor) -> Cloud:
-    """What a frame's foreground hides: the inpainted background where M = 0, which stands still in the world.
+def lift_hidden(
+    frame: EncodedFrame,
+    to_next: RigidMotion,
+    K: torch.Tensor,
+    flow: torch.Tensor | None = None,
+    span: torch.Tensor | float = 1.0,
+    flat: bool = False,
+) -> Cloud:
+    """What a frame's foreground hides: the inpainted background where M = 0, which is static in the world.
 
     Args:
         frame: B of them.
         to_next: the camera's motion.
         K: [B, 3, 3] px.
+        flow: [B, 3, H, W] m, that points follow as their pixels do, where no camera motion is forecast; None is
+            the camera's motion.
+        span: intervals of the clip that it takes; a tensor is [B, 1, 1, 1].
+        flat: motion is a 2D flow, see `in_plane`.
 
     Returns:
-        The cloud with |M = 0| points an image; differentiable in all but ``K``.
+        The cloud with |M = 0| points per image; differentiable in all but ``K``.
     """
     layers = frame.layers
     hidden = (layers.mask < FOREGROUND_BELOW).flatten(1)
@@ -123,10 +134,16 @@ def lift_hidden(frame: EncodedFrame, to_next: RigidMotion, K: torch.Tensor) -> C
 
     depth = layers.background_depth if len(where) else layers.background_depth[:, :, :0]
     points = pick(unproject(depth, K))
+    carried = _flow_of(points, to_next, sizes.tolist())
+    if flat:
+        carried = in_plane(points, carried)
+    moved = carried if flow is None else pick(as_points(flow))
+    if isinstance(span, torch.Tensor):
+        span = span.flatten().repeat_interleave(sizes)[:, None]
     return Cloud(
         points,
-        _flow_of(points, to_next, sizes.tolist()),
-        points.new_zeros(len(where), 3),
+        moved,
+        points.new_zeros(len(where), 3) if flow is None else (moved - carried) / span,
         layers.background_depth.flatten()[where],
         pick(as_points(frame.background_features)),
         pick(as_points(layers.background_image)),
@@ -157,25 +174,47 @@ def join(first: Cloud, second: Cloud) -> Cloud:
     return Cloud._make([*packed, tuple(grids), first.starts + second.starts])
 
 
-def advance(cloud: Cloud, next_from_cur: torch.Tensor) -> Cloud:
+def in_plane(points_xyz: torch.Tensor, displacement_xyz: torch.Tensor) -> torch.Tensor:
+    """(x + u) z / (x + u)_z - x: the displacement along the image to the same pixel, at the depth that the point has.
+
+    Args:
+        points_xyz: x [..., 3] m, z above 0.
+        displacement_xyz: u [..., 3] m.
+
+    Returns:
+        [..., 3] m, its z exactly 0; differentiable.
+    """
+    moved = points_xyz + displacement_xyz
+    along = moved[..., :2] * (points_xyz[..., 2:] / moved[..., 2:].clamp(min=constants.NEAR)) - points_xyz[..., :2]
+    return functional.pad(along, (0, 1))
+
+
+def advance(cloud: Cloud, next_from_cur: torch.Tensor, flat: bool = False) -> Cloud:
     """One frame interval on: x_(k+1) = G x_k + R s_k and s_(k+1) = R s_k, with G = (R, t) = ``next_from_cur``.
 
     The camera repeats its motion G [B, 4, 4], and what has moved beside it moves on at its velocity s in the world.
     What is fixed to the camera, x_1 = x, stays there while R = I. In a bend that is no constant velocity, and it drifts
     by (R - I) (x - G x) in the second step: the recording car's own bonnet at 1 m and 0.01 rad a frame by 1 cm.
+    With ``flat`` motion is a 2D flow, see `in_plane`.
     """
     points = cloud.points_xyz + cloud.displacement_xyz
     turned = _per_image(cloud.step_xyz, _rotation(next_from_cur), cloud.sizes)
-    moved = _per_image(points, next_from_cur, cloud.sizes) + turned
-    return cloud._replace(points_xyz=points, displacement_xyz=moved - points, step_xyz=turned)
+    displacement = _per_image(points, next_from_cur, cloud.sizes) + turned - points
+    if flat:
+        displacement = in_plane(points, displacement)
+    return cloud._replace(points_xyz=points, displacement_xyz=displacement, step_xyz=turned)
 
 
-def last_motion(cloud: Cloud, next_from_cur: torch.Tensor) -> torch.Tensor:
-    """x_k - x_(k-1) with x_(k-1) = G^-1 (x_k - s_k): for the previous frame's points, too, which came two intervals."""
+def last_motion(cloud: Cloud, next_from_cur: torch.Tensor, flat: bool = False) -> torch.Tensor:
+    """x_k - x_(k-1) with x_(k-1) = G^-1 (x_k - s_k): for the previous frame's points, too, which came two intervals.
+
+    With ``flat`` x_(k-1) is at the depth of x_k.
+    """
     still = cloud.points_xyz + cloud.displacement_xyz - cloud.step_xyz
     back = geometry.invert(next_from_cur)
     motion = RigidMotion(geometry.matrix_to_quaternion(back[:, :3, :3]), back[:, :3, 3])
-    return cloud.step_xyz - _flow_of(still, motion, cloud.sizes)
+    moved = cloud.step_xyz - _flow_of(still, motion, cloud.sizes)
+    return -in_plane(cloud.points_xyz + cloud.displacement_xyz, -moved) if flat else moved
 
 
 def _flow_of(points_xyz: torch.Tensor, rigid: RigidMotion, sizes: list[int]) -> torch.Tensor:

@@ -5,6 +5,7 @@ from typing import Final, NamedTuple
 import torch
 from torch.nn import functional
 
+from vestcl import constants
 from vestcl.models._layers import check
 from vestcl.models.encoder import STRIDE, upsample_features
 from vestcl.scene.layers import LayerBatch
@@ -55,11 +56,12 @@ def check_frames(frame_prev: LayerBatch, frame_cur: LayerBatch, K: torch.Tensor)
 
 
 def with_depth(layers: LayerBatch, metres: float | None) -> LayerBatch:
-    """All depths replaced by ``metres``; None leaves them."""
+    """All depths replaced by ``metres``, the background's behind foreground by BEHIND times it; None leaves them."""
     if metres is None:
         return layers
     flat = torch.full_like(layers.depth, metres)
-    return layers._replace(depth=flat, background_depth=flat)
+    behind = torch.where(layers.mask < FOREGROUND_BELOW, constants.BEHIND * flat, flat)
+    return layers._replace(depth=flat, background_depth=behind)
 
 
 def grid_depth(depth: torch.Tensor) -> torch.Tensor:

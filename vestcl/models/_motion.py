@@ -1,11 +1,13 @@
 """How everything moves to the next frame, and what follows from it: the answer of a forecast's step, the next prior."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+from torch.nn import functional
 
 from vestcl import geometry
-from vestcl.models._clouds import as_image
+from vestcl.models._clouds import as_image, as_points, in_plane
 from vestcl.models._frames import EncodedFrame
 from vestcl.models._render import RenderedView
 from vestcl.models.ego_motion import CameraMotion, RigidMotion
@@ -71,7 +73,24 @@ def next_prior(prior: MotionPrior, motion: Motion, seen: RenderedView, K: torch.
     return repeated(prior, motion.next_from_cur, moved, seen, K)
 
 
-def arrived(prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, to_next: MotionPrior | CameraMotion) -> Motion:
+def flattened(points: Sequence[torch.Tensor], flow: torch.Tensor) -> torch.Tensor:
+    """`in_plane` of both frames' pixels: ``points`` two of [B, H W, 3] m, ``flow`` [B, 6, H, W] m, as the result."""
+    pairs = zip(points, flow.split(3, dim=1), strict=True)
+    return torch.cat([as_image(in_plane(xyz, as_points(of_frame)), *flow.shape[2:]) for xyz, of_frame in pairs], dim=1)
+
+
+def without_z(flow: torch.Tensor) -> torch.Tensor:
+    """[B, 6, H, W] m with 0 for the z of both frames' pixels; differentiable."""
+    return torch.cat([functional.pad(of[:, :2], (0, 0, 0, 0, 0, 1)) for of in flow.split(3, dim=1)], dim=1)
+
+
+def arrived(
+    prev: EncodedFrame,
+    cur: EncodedFrame,
+    K: torch.Tensor,
+    to_next: MotionPrior | CameraMotion,
+    flat: bool = False,
+) -> Motion:
     """The motion that brings what t - 1 shows to t, and leaves alone what t shows.
 
     Args:
@@ -79,6 +98,7 @@ def arrived(prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, to_next: Mot
         cur: frame at t.
         K: [B, 3, 3] px.
         to_next: the camera's motion, or a prior, of which what moves beside the camera comes along, too.
+        flat: motion is a 2D flow, see `in_plane`.
     """
     if isinstance(to_next, MotionPrior):
         cur_from_prev = to_next.cur_from_prev
@@ -95,6 +115,8 @@ def arrived(prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, to_next: Mot
         elapsed = to_next.span - 1
         beside = elapsed * torch.einsum("bij,bjhw->bihw", turn, to_next.velocity_prev)
         flow = flow0 + torch.cat([beside, torch.zeros_like(beside)], dim=1)
+    if flat:
+        flow0, flow = flattened(points, flow0), flattened(points, flow)
     objects = ObjectMotionForecast(flow, [], torch.zeros(len(flow), 0, dtype=torch.bool), None)
     rest, spans = RigidMotion.rest(cur.features), (elapsed, 1.0)
     return Motion(cur_from_prev, rest, (), points, flow0, flow, objects, spans)

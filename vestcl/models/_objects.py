@@ -66,6 +66,10 @@ def move_objects(
         return unmoved(start)
     seen = [prev.features, cur.features]
     seen += [prev.layers.depth, cur.layers.depth, prev.layers.mask, cur.layers.mask]
+    backgrounds = list[torch.Tensor]()
+    if network.config.inpainted:
+        backgrounds += [prev.background_features, cur.background_features]
+        backgrounds += [prev.layers.background_depth, cur.layers.background_depth]
     flows = list(zip((prev, cur), to_next[:2], flow0.split(3, dim=1), strict=True))
     pieces, forecasts = list[_Piece](), list[ObjectMotionForecast]()
     for box in found:
@@ -76,7 +80,8 @@ def move_objects(
         ], dim=1)  # fmt: skip
         moves = box.cut(moving) if network.config.where == "foreground" else None
         pieces.append(_Piece(box, beyond, box.cut(start), moves))
-        forecasts.append(network(*map(box.cut, seen), box.cut(start) - beyond, blocks=blocks))
+        behind = list(map(box.cut, backgrounds))
+        forecasts.append(network(*map(box.cut, seen), box.cut(start) - beyond, blocks=blocks, backgrounds=behind))
 
     def whole(parts: Iterable[torch.Tensor]) -> torch.Tensor:
         flow = start.clone()

@@ -1,5 +1,6 @@
 """From a forecast frame back to layers, so that it can be an input of the next step."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
@@ -8,9 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from vestcl.io.labels import SKY, background
 from vestcl.models._frames import FOREGROUND_BELOW
 from vestcl.models._render import Camera, RenderedView
 from vestcl.scene import layers
+from vestcl.scene.estimators.sources import CheckedClasses, CheckedDepth
 from vestcl.scene.layers import SKY_DEPTH, LayerBatch
 
 #: image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W] of 0 and 1 -> their layers.
@@ -34,8 +37,41 @@ def perceive_forecast(image: torch.Tensor, depth: torch.Tensor, mask: torch.Tens
     Raises:
         ValueError: a frame without any known depth.
     """
-    frames = zip(*(tensor.detach().float().cpu().numpy() for tensor in (image, depth, mask)), strict=True)
-    return layers.batch([_layers(*frame) for frame in frames])
+    return _of_frames(_layers, image, depth, mask)
+
+
+def perceive_estimated(
+    depth: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
+    segmentation: Callable[[NDArray[np.float32]], NDArray[np.uint8]] | None = None,
+) -> Perceive:
+    """Layers of forecast frames by the estimators that see recorded frames: of depth, of classes, or of both.
+
+    Args:
+        depth: [3, H, W] RGB in [0, 1] -> [1, H, W] m, 0 = unknown: a `vestcl.scene.estimators.DepthEstimator` or any
+            function; None keeps the splatted depth.
+        segmentation: [3, H, W] -> [1, H, W] uint8 train ids: a `SegmentationEstimator` or any function; None keeps the
+            splatted mask, and takes what is splatted from far away for sky.
+
+    Returns:
+        What `vestcl.models.forecaster.Forecaster.forecast` takes for ``perceive``; it raises a ValueError where an
+        estimator answers with another shape or with depths or classes that can't be.
+    """
+    depth_of = None if depth is None else CheckedDepth(depth)
+    classes_of = None if segmentation is None else CheckedClasses(segmentation)
+
+    def layers_of(image: NDArray[Any], splatted: NDArray[Any], mask: NDArray[Any]) -> layers.Layers:
+        image = np.ascontiguousarray(image)
+        metres = _filled(splatted)
+        far = metres >= _SKY_FROM
+        sky = far
+        if classes_of is not None:
+            ids = classes_of(image)
+            mask, sky = background(ids), (ids == SKY) | (far & (depth_of is None))
+        if depth_of is not None:
+            metres = depth_of(image)
+        return layers.build_layers(image, metres, mask >= FOREGROUND_BELOW, sky=sky)
+
+    return functools.partial(_of_frames, layers_of)
 
 
 def perceive_view(view: RenderedView, perceive: Perceive) -> LayerBatch:
@@ -53,7 +89,23 @@ def known_view(cameras: Sequence[Camera], views: Sequence[RenderedView], wanted:
     return None
 
 
+def _of_frames(
+    layers_of: Callable[[NDArray[Any], NDArray[Any], NDArray[Any]], layers.Layers],
+    image: torch.Tensor,
+    depth: torch.Tensor,
+    mask: torch.Tensor,
+) -> LayerBatch:
+    frames = zip(*(tensor.detach().float().cpu().numpy() for tensor in (image, depth, mask)), strict=True)
+    return layers.batch([layers_of(*frame) for frame in frames])
+
+
 def _layers(image: NDArray[Any], depth: NDArray[Any], mask: NDArray[Any]) -> layers.Layers:
+    filled = _filled(depth)
+    return layers.build_layers(image, filled, mask >= FOREGROUND_BELOW, sky=filled >= _SKY_FROM)
+
+
+def _filled(depth: NDArray[Any]) -> NDArray[Any]:
+    """[1, H, W] m, unknown depths from the nearest pixel that has one."""
     known = depth[0] > 0
     if not known.any():
         raise ValueError("`depth` must be known (above 0 m) somewhere: no point of the forecast is in the picture")
@@ -62,6 +114,4 @@ def _layers(image: NDArray[Any], depth: NDArray[Any], mask: NDArray[Any]) -> lay
     )
     at = np.zeros(nearest.max() + 1, np.intp)
     at[nearest[known]] = known.ravel().nonzero()[0]
-    filled = depth.ravel()[at[nearest]][None]
-    sky = filled >= _SKY_FROM
-    return layers.build_layers(image, filled, mask >= FOREGROUND_BELOW, sky=sky)
+    return np.asarray(depth.ravel()[at[nearest]][None])

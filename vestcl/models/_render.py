@@ -115,6 +115,7 @@ def splat_cloud(
     open_: torch.Tensor | None = None,
     tally: Tally | None = None,
     deep: torch.Tensor | None = None,
+    flat: bool = False,
 ) -> Side:
     """Show a cloud in ``camera``: opaque points of radius r = rho z_src / z_tgt f_tgt / f_src, clamped to RADIUS.
 
@@ -133,6 +134,7 @@ def splat_cloud(
         open_: bool [B, 1, H, W], the pixels that count: others may be left empty. None is all.
         tally: is told how many points reach none of them, and are left out; None leaves out none.
         deep: bool [B, 1, H, W], the pixels where inpainted points count, from `inner_holes`; None is all.
+        flat: motion is a 2D flow, see `vestcl.models._clouds.in_plane`.
 
     Returns:
         What is seen; differentiable in the cloud, through positions, radii and inverse depth.
@@ -163,7 +165,7 @@ def splat_cloud(
             points_uv, order, near, radii, opacities = (t[kept] for t in (points_uv, order, near, radii, opacities))
     raster = rasterize(points_uv, order, radii, opacities, height, width, cloud_starts=starts)
     with torch.no_grad():
-        measured = cloud.background, last_motion(cloud, next_from_cur) / near[:, None]
+        measured = cloud.background, last_motion(cloud, next_from_cur, flat) / near[:, None]
     known = torch.cat([cloud.colour, near.reciprocal()[:, None], *measured], dim=1)
     features, coverage = composite(raster, cloud.features, None, min_transmittance)
     return Side(features, composite(raster, known, None, min_transmittance)[0], coverage)

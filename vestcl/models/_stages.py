@@ -1,5 +1,6 @@
 """The networks and the stages of a forecast, from left to right as in the paper's figure."""
 
+import functools
 import itertools
 from collections.abc import Sequence
 
@@ -12,7 +13,7 @@ from vestcl.models._encode import encode
 from vestcl.models._frames import EncodedFrame, grid_depth, grid_mean, with_depth
 from vestcl.models._layers import side_by_side
 from vestcl.models._memory import Memory, State
-from vestcl.models._motion import Motion
+from vestcl.models._motion import Motion, flattened, without_z
 from vestcl.models._objects import move_objects, unmoved
 from vestcl.models._render import (
     Camera,
@@ -62,6 +63,11 @@ class Stages(nn.Module):
         #: The frames that were encoded last.
         self.memory = Memory()
 
+    @property
+    def flat(self) -> bool:
+        """Whether all motion is a 2D flow: without depth there is no z."""
+        return self.config.fixed_depth is not None
+
     @timed
     def encode(self, frame: LayerBatch) -> EncodedFrame:
         """Features of a frame and of its background, in one pass, and what EMF sees in it; backgrounds without
@@ -89,7 +95,14 @@ class Stages(nn.Module):
             self.memory.keep(state, frame, encoded)
         return encoded
 
-    def move(self, prev: EncodedFrame, cur: EncodedFrame, K: torch.Tensor, prior: MotionPrior | None = None) -> Motion:
+    def move(
+        self,
+        prev: EncodedFrame,
+        cur: EncodedFrame,
+        K: torch.Tensor,
+        prior: MotionPrior | None = None,
+        own: torch.Tensor | None = None,
+    ) -> Motion:
         """The camera's motion from both frames to the next, the rigid flow that it makes, and the objects' flow.
 
         Args:
@@ -97,28 +110,50 @@ class Stages(nn.Module):
             cur: frame at t.
             K: [B, 3, 3] px.
             prior: what both start from.
+            own: [B, 1, H, W], 1 where the recording car itself is in the image, see `move_camera`.
 
         Returns:
             `Motion`; differentiable.
         """
-        to_next = self.move_camera(prev, cur, prior)
+        to_next = self.move_camera(prev, cur, prior, own)
         points = unproject(prev.layers.depth, K), unproject(cur.layers.depth, K)
         flows = [rigid_flow(xyz, *rigid) for xyz, rigid in zip(points, to_next[:2], strict=True)]
         flow0 = as_image(torch.cat(flows, dim=2), *cur.features.shape[2:])
         start = flow0 if prior is None or self.object_motion is None else flow0 + beside(prior, to_next[:2])
+        if self.flat:
+            flow0, start = flattened(points, flow0), flattened(points, start)
         spans = (2.0 if prior is None else prior.span, 1.0)
         if prior is not None and not prior.is_corrected:
             return Motion(*to_next, points, flow0, start, unmoved(start), spans)
-        return Motion(*to_next, points, flow0, start, self.move_objects(prev, cur, to_next, flow0, start), spans)
+        objects = self.move_objects(prev, cur, to_next, flow0, start)
+        if self.flat:
+            candidates = [without_z(candidate) for candidate in objects.candidates]
+            objects = objects._replace(flow=without_z(objects.flow), candidates=candidates)
+        return Motion(*to_next, points, flow0, start, objects, spans)
 
     @timed
-    def move_camera(self, prev: EncodedFrame, cur: EncodedFrame, prior: MotionPrior | None = None) -> CameraMotion:
-        """EMF on the encoder's grid: the camera's motion; rest where the model has no EMF, an uncorrected prior's."""
+    def move_camera(
+        self,
+        prev: EncodedFrame,
+        cur: EncodedFrame,
+        prior: MotionPrior | None = None,
+        own: torch.Tensor | None = None,
+    ) -> CameraMotion:
+        """EMF on the encoder's grid: the camera's motion; rest where the model has no EMF, an uncorrected prior's.
+
+        Args:
+            prev: frame at t - 1.
+            cur: frame at t.
+            prior: what EMF starts from.
+            own: [B, 1, H, W], 1 where the recording car itself is in either image: it moves with the camera, so
+                tokens of it are masked, as foreground is; None is nowhere.
+        """
         if prior is not None and not prior.is_corrected:
             return CameraMotion(prior.next_from_cur.after(prior.cur_from_prev), prior.next_from_cur)
         if self.ego_motion is None or prev.camera_grid is None or cur.camera_grid is None:
             return CameraMotion(*2 * (RigidMotion.rest(cur.features),))
-        mask_prev, mask_cur = (grid_mean(frame.layers.mask) for frame in (prev, cur))
+        masks = [frame.layers.mask if own is None else frame.layers.mask * (1 - own) for frame in (prev, cur)]
+        mask_prev, mask_cur = map(grid_mean, masks)
         known = None if prior is None else (prior.next_from_cur, prior.cur_from_prev, prior.prev_from_before)
         return self.ego_motion.decide(prev.camera_grid, cur.camera_grid, mask_prev, mask_cur, known)
 
@@ -142,6 +177,9 @@ class Stages(nn.Module):
     def lift(self, prev: EncodedFrame, cur: EncodedFrame, motion: Motion, K: torch.Tensor) -> list[Cloud]:
         """Both frames' layers as clouds on their way to t + 1; with `RenderConfig.joint` as one.
 
+        Inpainted points follow the camera's motion. Without EMF there is none: they move as object motion says at their
+        pixel.
+
         Args:
             prev: frame at t - 1.
             cur: frame at t.
@@ -156,11 +194,15 @@ class Stages(nn.Module):
         of_prev, of_cur = itertools.starmap(
             lift, zip((prev, cur), motion.points, flows, flows0, motion.spans, strict=True)
         )
-        behind_cur = lift_hidden(cur, rigid[1], K)
+        by_objects = self.ego_motion is None and motion.objects.ran.shape[1] > 0
+        behind_prev, behind_cur = (
+            functools.partial(lift_hidden, frame, to_next, K, flow if by_objects else None, span, self.flat)
+            for frame, to_next, flow, span in zip((prev, cur), rigid, flows, motion.spans, strict=True)
+        )
         if render.inpainted != "own":
-            clouds = [join(of_prev, behind_cur), of_cur]
+            clouds = [join(of_prev, behind_cur()), of_cur]
         else:
-            clouds = [join(of_prev, lift_hidden(prev, rigid[0], K)), join(of_cur, behind_cur)]
+            clouds = [join(of_prev, behind_prev()), join(of_cur, behind_cur())]
         return [join(*clouds)] if render.joint else clouds
 
     def show(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> RenderedView:
@@ -214,12 +256,13 @@ class Stages(nn.Module):
     ) -> list[Side]:
         known = camera, K, motion.rigid.detach(), self.config.render, *size, self.effort.min_transmittance
         if self.config.render.previous == "all" or len(clouds) == 1:
-            return [splat_cloud(cloud, *known) for cloud in clouds]
+            return [splat_cloud(cloud, *known, flat=self.flat) for cloud in clouds]
         prev, cur = clouds
-        front = splat_cloud(cur, *known)
+        front = splat_cloud(cur, *known, flat=self.flat)
         uncovered = front.coverage.detach() < OPAQUE
         deep = inner_holes(uncovered) if self.config.render.inpainted == "inner" else None
-        behind = splat_cloud(prev, *known, uncovered, current_tally() if self.skip.covered else None, deep)
+        tally = current_tally() if self.skip.covered else None
+        behind = splat_cloud(prev, *known, uncovered, tally, deep, self.flat)
         return [Side(*(plane * uncovered for plane in behind)), front]
 
     def _state(self) -> State | None:

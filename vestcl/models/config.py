@@ -2,16 +2,19 @@
 
     vest-paper              the paper's widths
     vest-s                  widths that two CPU cores train
-    +fixed-depth            ablation A of the paper: every pixel at FIXED_DEPTH
+    +fixed-depth            ablation A of the paper: every pixel at FIXED_DEPTH; +fixed-depth=35 puts it at 35 m
     +no-emf  +no-omf        ablations B and C: without ego-motion (object motion moves all), without object motion
-    +features-only          the paper's literal 32 rendered channels: features and nothing else
+    +colour                 colour, coverage and inverse depth are rendered, too: 37 channels a side in place of 32
+    +features-only          the features and nothing else are rendered, as vest-paper does
     +joint                  both clouds splatted together in one depth-ordered pass
     +residual               refinement adds to the splatted colour instead of painting anew
     +filled                 it adds to that colour divided by coverage, holes filled from what surrounds them
     +painting               it paints anew
     +from-rest              motion starts from rest, not from what was measured
     +from-prior             motion starts from what was measured: see `MotionPrior`
+    +feedback  +compose     how later frames are forecast by default; without them as `ModelConfig.mode` says
     +omf-paper  +omf-dmvfn  the two published shapes of object motion
+    +omf-inpainted          object motion sees the inpainted layers, too
     +routing                a small network picks which blocks of object motion run
 
 Source: SPEC sections 3 to 7.
@@ -21,16 +24,20 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 from vestcl import constants
+
+Mode = Literal["feedback", "compose"]
+"""How frames after the first are forecast; see `vestcl.models.forecaster.Forecaster.forecast`."""
 
 #: Depth goes into the networks as log(metres), clamped from below where the splatter stops drawing ...
 LOG_DEPTH_NEAR: Final = constants.NEAR
 #: ... and from above where, for a car's camera, everything is equally far: 1 km moves less than a pixel a frame.
 LOG_DEPTH_FAR: Final = 1000.0
 
-#: Depth of every pixel in the ablation "fixed depth", metres: about the median of a street seen from a car.
+#: Depth of every pixel in the ablation "fixed depth", metres, where the variant gives none: about the median of a
+#: street seen from a car. The paper takes the best one, so search: +fixed-depth=10, =20, =40 ...
 FIXED_DEPTH: Final = 20.0
 
 #: Channels a group of GroupNorm: encoder (of 1 to 64 that its authors tried on ImageNet, 16 were the best) ...
@@ -117,6 +124,8 @@ class ObjectMotionConfig:
     """"foreground": what the mask says is static background keeps the motion that object motion starts from."""
     routing: RoutingConfig | None = None
     """None runs every block."""
+    inpainted: bool = False
+    """Blocks see the features and log depths of both frames' inpainted backgrounds, too."""
 
     def __post_init__(self) -> None:
         if self.shape not in ("paper", "dmvfn"):
@@ -134,7 +143,7 @@ class RenderConfig:
     """What the clouds carry to the new view, and how they are splatted."""
 
     colour: bool = True
-    """Colour, coverage and inverse depth beside the features; False renders features alone."""
+    """Colour, coverage and inverse depth are rendered with the features; False renders only the features."""
     joint: bool = False
     """Both clouds in one depth-ordered pass; False renders each on its own, previous frame first."""
     rho: float = RHO
@@ -188,19 +197,30 @@ class ModelConfig:
     name: str
     encoder: EncoderConfig = EncoderConfig()
     ego_motion: EgoMotionConfig | None = EgoMotionConfig()
-    """None: cameras are taken to stand still, and object motion has to explain it all."""
+    """None: cameras are assumed static, and object motion has to explain it all, that of inpainted points, too."""
     object_motion: ObjectMotionConfig | None = ObjectMotionConfig()
     """None: all points follow the camera's motion."""
     render: RenderConfig = RenderConfig()
     refine: RefineConfig = RefineConfig()
     fixed_depth: float | None = None
-    """Metres, for every pixel; None uses the depth that comes in."""
+    """Metres, for every pixel, and 1 % more for the background that foreground hides. Motion is then a 2D flow: its z
+    is 0. None uses the depth that comes in."""
     start: Literal["rest", "prior"] = "rest"
     """What motion networks correct: no motion, or one that was measured and extrapolated (`MotionPrior`)."""
     interval_s: float = 0.1
     """Seconds from frame to frame that motion networks learned at; a prior over another interval is not corrected."""
+    mode: Mode | None = None
+    """How frames after the first are forecast unless a call says otherwise; None follows `start`: "feedback" from rest,
+    as the paper does, "compose" from a prior. `default_mode` has the answer."""
+
+    @property
+    def default_mode(self) -> Mode:
+        """`mode`, or what follows from `start`."""
+        return self.mode or ("feedback" if self.start == "rest" else "compose")
 
     def __post_init__(self) -> None:
+        if self.mode is not None and self.mode not in get_args(Mode):
+            raise ValueError(f'`mode` must be "feedback", "compose" or None, got {self.mode!r}')
         if self.start not in ("rest", "prior"):
             raise ValueError(f'`start` must be "rest" or "prior", got {self.start!r}')
         if self.start == "rest" and self.ego_motion is not None and self.ego_motion.path > 1:
@@ -208,14 +228,14 @@ class ModelConfig:
         if not 0 < self.interval_s < float("inf"):
             raise ValueError(f"`interval_s` must be positive seconds, got {self.interval_s}")
         if self.refine.base != "none" and not self.render.colour:
-            raise ValueError("`refine.base` adds to the rendered colour, so it needs `render.colour`")
+            raise ValueError("`refine.base` adds to the rendered colour, so it needs `render.colour` (+colour)")
         if self.refine.base == "filled" and not self.render.normalised:
             raise ValueError('`refine.base` "filled" needs `render.normalised`')
         if self.fixed_depth is not None and not LOG_DEPTH_NEAR <= self.fixed_depth <= LOG_DEPTH_FAR:
             raise ValueError(f"`fixed_depth` must be in [{LOG_DEPTH_NEAR}, {LOG_DEPTH_FAR}] m, got {self.fixed_depth}")
 
 
-VEST_PAPER: Final = ModelConfig("vest-paper")
+VEST_PAPER: Final = ModelConfig("vest-paper", render=RenderConfig(colour=False))
 
 VEST_S: Final = ModelConfig(
     "vest-s",
@@ -257,40 +277,61 @@ def _jointly(config: ModelConfig) -> ModelConfig:
     return dataclasses.replace(config, render=dataclasses.replace(config.render, joint=True, inpainted=inpainted))
 
 
-def _without_colour(config: ModelConfig) -> ModelConfig:
-    return dataclasses.replace(config, render=dataclasses.replace(config.render, colour=False))
+def _with_fixed_depth(config: ModelConfig, metres: float = FIXED_DEPTH) -> ModelConfig:
+    """At a wrong depth the camera's motion moves the background wrongly, too: object motion corrects all pixels."""
+    objects = config.object_motion and dataclasses.replace(config.object_motion, where="everywhere")
+    return dataclasses.replace(config, fixed_depth=metres, object_motion=objects)
+
+
+def _render_colour(config: ModelConfig, colour: bool) -> ModelConfig:
+    return dataclasses.replace(config, render=dataclasses.replace(config.render, colour=colour))
 
 
 def _change_base(config: ModelConfig, base: Literal["none", "splatted", "filled"]) -> ModelConfig:
-    render = dataclasses.replace(config.render, normalised=base == "filled")
+    """A base other than "none" is made of the rendered colour."""
+    colour = config.render.colour or base != "none"
+    render = dataclasses.replace(config.render, normalised=base == "filled", colour=colour)
     return dataclasses.replace(config, refine=dataclasses.replace(config.refine, base=base), render=render)
 
 
 #: What may follow a model's name after "+": the change that it makes.
 VARIANTS: Final[Mapping[str, Callable[[ModelConfig], ModelConfig]]] = MappingProxyType(
     {
-        "fixed-depth": lambda c: dataclasses.replace(c, fixed_depth=FIXED_DEPTH),
+        "fixed-depth": _with_fixed_depth,
         "no-emf": _without_ego_motion,
         "no-omf": lambda c: dataclasses.replace(c, object_motion=None),
-        "features-only": lambda c: _without_colour(_change_base(c, "none")),
+        "colour": lambda c: _render_colour(c, True),
+        "features-only": lambda c: _render_colour(_change_base(c, "none"), False),
         "joint": _jointly,
         "residual": lambda c: _change_base(c, "splatted"),
         "filled": lambda c: _change_base(c, "filled"),
         "painting": lambda c: _change_base(c, "none"),
         "from-rest": _from_rest,
         "from-prior": lambda c: dataclasses.replace(c, start="prior"),
+        "feedback": lambda c: dataclasses.replace(c, mode="feedback"),
+        "compose": lambda c: dataclasses.replace(c, mode="compose"),
         "omf-paper": lambda c: _change_object_motion(c, shape="paper"),
         "omf-dmvfn": lambda c: _change_object_motion(c, shape="dmvfn"),
+        "omf-inpainted": lambda c: _change_object_motion(c, inpainted=True),
         "routing": lambda c: _change_object_motion(c, routing=RoutingConfig()),
     }
 )
+
+
+#: Variants that take a number after "=".
+_WITH_NUMBER: Final[Mapping[str, Callable[[ModelConfig, float], ModelConfig]]] = MappingProxyType(
+    {"fixed-depth": _with_fixed_depth}
+)
+
+#: Variants that need the rendered colour.
+_OF_COLOUR: Final = ("colour", "residual", "filled")
 
 
 def configuration(name: str) -> ModelConfig:
     """A model by name, with any variants: "vest-paper", "vest-s+no-emf", "vest-s+joint+residual".
 
     Args:
-        name: a key of `CONFIGS`, then "+" and a key of `VARIANTS` as often as wanted.
+        name: a key of `CONFIGS`, then "+" and a key of `VARIANTS` as often as wanted; "+fixed-depth=35" sets metres.
 
     Returns:
         The configuration; its name is ``name``.
@@ -301,9 +342,24 @@ def configuration(name: str) -> ModelConfig:
     base, *variants = name.split("+")
     if base not in CONFIGS:
         raise ValueError(f"`name` must begin with one of {', '.join(CONFIGS)}, got {base!r}")
+    if "features-only" in variants and (of_colour := [v for v in variants if v in _OF_COLOUR]):
+        raise ValueError(f"`name` must not have both +{of_colour[0]}, which needs `render.colour`, and +features-only")
     config = CONFIGS[base]
     for variant in variants:
-        if variant not in VARIANTS:
-            raise ValueError(f"`name` may add {', '.join(f'+{v}' for v in VARIANTS)}, got {f'+{variant}'!r}")
-        config = VARIANTS[variant](config)
+        config = _changed(config, variant)
     return dataclasses.replace(config, name=name)
+
+
+def _changed(config: ModelConfig, variant: str) -> ModelConfig:
+    """``config`` with one variant, "no-emf" or "fixed-depth=35"."""
+    kind, equals, number = variant.partition("=")
+    if kind not in VARIANTS:
+        raise ValueError(f"`name` may add {', '.join(f'+{v}' for v in VARIANTS)}, got {f'+{variant}'!r}")
+    if not equals:
+        return VARIANTS[kind](config)
+    if kind not in _WITH_NUMBER:
+        raise ValueError(f"`name` may give {', '.join(f'+{v}' for v in _WITH_NUMBER)} a number, got {f'+{variant}'!r}")
+    try:
+        return _WITH_NUMBER[kind](config, float(number))
+    except ValueError as error:
+        raise ValueError(f"`name`: {f'+{variant}'!r}: {error}") from error

@@ -2,25 +2,36 @@
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import get_args
 
 import torch
 
 from vestcl.models._checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models._clouds import Cloud, advance
 from vestcl.models._frames import check_frames
+from vestcl.models._layers import check
 from vestcl.models._motion import Motion, Step, arrived, next_prior
-from vestcl.models._perceive import Perceive, known_view, perceive_forecast, perceive_view
+from vestcl.models._perceive import Perceive, known_view, perceive_estimated, perceive_forecast, perceive_view
 from vestcl.models._render import Camera, RenderedView, checked_camera
 from vestcl.models._stages import Stages
 from vestcl.models._weights import misfit
+from vestcl.models.config import Mode
 from vestcl.models.prior import MotionPrior, check_prior
 from vestcl.models.skipping import current_tally
 from vestcl.scene.layers import LayerBatch
 
-__all__ = ["Camera", "Forecaster", "Mode", "Motion", "Perceive", "RenderedView", "Step", "perceive_forecast"]
+__all__ = [
+    "Camera",
+    "Forecaster",
+    "Mode",
+    "Motion",
+    "Perceive",
+    "RenderedView",
+    "Step",
+    "perceive_estimated",
+    "perceive_forecast",
+]
 
-Mode = Literal["feedback", "compose"]
 Views = Sequence[tuple[torch.Tensor, torch.Tensor]]
 
 
@@ -28,8 +39,8 @@ class Forecaster(Stages):
     """Encode, lift, forecast the camera's and then the objects' motion, displace, splat, refine.
 
     Both input frames become a cloud each: every pixel, and where foreground hides the background that is inpainted
-    behind it. Inpainted points move with the static world, all others as object motion says. Both clouds go to t + 1
-    directly, and are splatted there into every camera that is asked for.
+    behind it. Inpainted points move with the static world, all others as object motion says; without EMF
+    all do. Both clouds go to t + 1 directly, and are splatted there into every camera that is asked for.
 
     Args:
         config: sizes and choices; `vestcl.models.configuration` knows some by name.
@@ -45,10 +56,11 @@ class Forecaster(Stages):
         views: Views | None = None,
         *,
         prior: MotionPrior | None = None,
+        own: torch.Tensor | None = None,
         horizon: int = 1,
     ) -> Step:
         """Frame t + ``horizon``, motion composed, with everything that a loss needs; arguments as of `forecast`."""
-        last = {"mode": "compose", "shown": (horizon,), "prior": prior}
+        last = {"mode": "compose", "shown": (horizon,), "prior": prior, "own": own}
         return self.forecast(frame_prev, frame_cur, K, horizon, views, **last)[-1]  # type: ignore[arg-type]
 
     def forecast(
@@ -58,10 +70,11 @@ class Forecaster(Stages):
         K: torch.Tensor,
         steps: int = 1,
         views: Views | None = None,
-        mode: Mode = "feedback",
+        mode: Mode | None = None,
         perceive: Perceive | None = None,
         *,
         prior: MotionPrior | None = None,
+        own: torch.Tensor | None = None,
         shown: Collection[int] | None = None,
     ) -> list[Step]:
         """Forecast t + 1 to t + steps.
@@ -75,11 +88,14 @@ class Forecaster(Stages):
                 is the source camera alone; none at all forecasts motion, with "compose" alone.
             mode: "feedback" takes each forecast frame, as the source camera sees it, for an input of the next step;
                 no gradient passes from step to step. "compose" encodes nothing anew: the camera goes on as was forecast
-                at t, and repeats its last motion beyond that; things repeat in the world what they did beside it.
+                at t, and repeats its last motion beyond that; objects repeat their own motion in the world. None is
+                `ModelConfig.default_mode`.
             perceive: for "feedback", (image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W])
                 -> layers of that forecast frame; None is `perceive_forecast`.
             prior: motion that was measured, for models that start from it and no others; with "feedback" each later
                 step starts from the motion of the step before.
+            own: [B, 1, H, W], 1 where the recording car itself is in the images, which EMF's attention and mean leave
+                out; it stays there in later frames. None is nowhere.
             shown: steps k to show, of 1 ... steps; None shows all.
 
         Returns:
@@ -89,13 +105,14 @@ class Forecaster(Stages):
             ValueError: an argument of another shape, a depth that is not above 0, less than one step, another mode,
                 or a prior that is missing or not wanted.
         """
-        self._check(frame_prev, frame_cur, K, prior)
-        if steps < 1 or mode not in ("feedback", "compose"):
+        self._check(frame_prev, frame_cur, K, prior, own)
+        mode = mode or self.config.default_mode
+        if steps < 1 or mode not in get_args(Mode):
             raise ValueError(f'`steps` must be >= 1 and `mode` "feedback" or "compose", got {steps} and {mode!r}')
         straight = Camera(torch.eye(4).to(K).expand(len(K), 4, 4), K)
         cameras = [straight] if views is None else [checked_camera(camera, len(K)) for camera in views]
         prev, cur = self.encode(frame_prev), self.encode(frame_cur)
-        motion = self.move(prev, cur, K, prior)
+        motion = self.move(prev, cur, K, prior, own)
         clouds = self.lift(prev, cur, motion, K) if cameras else []
         done, shown = list[Step](), set(range(1, steps + 1) if shown is None else shown)
         future_from_cur, path_from_cur = motion.rigid, motion.path(steps)
@@ -107,18 +124,24 @@ class Forecaster(Stages):
                 return done
             if mode == "compose":
                 motion = motion.following()
-                clouds = [advance(cloud, motion.rigid) for cloud in clouds]
+                clouds = [advance(cloud, motion.rigid, self.flat) for cloud in clouds]
             else:
                 looked = known_view(cameras, seen, straight) if seen else None
                 view = looked or self.show(clouds, straight, motion, K)
                 prior = None if prior is None else next_prior(prior, motion, view, K)
                 prev, cur = cur, self.encode(perceive_view(view, perceive or perceive_forecast))
-                motion = self.move(prev, cur, K, prior)
+                motion = self.move(prev, cur, K, prior, own)
                 clouds = self.lift(prev, cur, motion, K)
             future_from_cur = motion.rigid @ future_from_cur
 
     def present(
-        self, frame_prev: LayerBatch, frame_cur: LayerBatch, K: torch.Tensor, views: Views, prior: MotionPrior | None
+        self,
+        frame_prev: LayerBatch,
+        frame_cur: LayerBatch,
+        K: torch.Tensor,
+        views: Views,
+        prior: MotionPrior | None,
+        own: torch.Tensor | None = None,
     ) -> list[RenderedView]:
         """Frame t itself from other cameras: what t shows stays where it is, and what t - 1 shows comes to t.
 
@@ -130,17 +153,19 @@ class Forecaster(Stages):
             K: [B, 3, 3] px, of both.
             views: the cameras to show, as (tgt_from_cur [B, 4, 4], K [B, 3, 3]).
             prior: as of `forecast`.
+            own: as of `forecast`.
 
         Returns:
-            A view a camera; differentiable.
+            A view per camera; differentiable.
 
         Raises:
             ValueError: as `forecast`.
         """
-        self._check(frame_prev, frame_cur, K, prior)
+        self._check(frame_prev, frame_cur, K, prior, own)
         cameras = [checked_camera(camera, len(K)) for camera in views]
         prev, cur = self.encode(frame_prev), self.encode(frame_cur)
-        motion = arrived(prev, cur, K, self.move_camera(prev, cur, prior) if prior is None else prior)
+        to_next = self.move_camera(prev, cur, None, own) if prior is None else prior
+        motion = arrived(prev, cur, K, to_next, self.flat)
         clouds = self.lift(prev, cur, motion, K)
         return self._show_all(clouds, cameras, motion, K)
 
@@ -155,8 +180,18 @@ class Forecaster(Stages):
             views.append(known or self.show(clouds, camera, motion, K))
         return views
 
-    def _check(self, frame_prev: LayerBatch, frame_cur: LayerBatch, K: torch.Tensor, prior: MotionPrior | None) -> None:
+    def _check(
+        self,
+        frame_prev: LayerBatch,
+        frame_cur: LayerBatch,
+        K: torch.Tensor,
+        prior: MotionPrior | None,
+        own: torch.Tensor | None,
+    ) -> None:
         check_frames(frame_prev, frame_cur, K)
+        if own is not None:
+            batch, _, height, width = frame_cur.image.shape
+            check(own=(own, f"{batch} 1 {height} {width}"))
         if (prior is None) == (self.config.start == "prior"):
             wanted = "a `MotionPrior`" if prior is None else "None"
             raise ValueError(f"`prior` must be {wanted} for {self.config.name}, which starts from {self.config.start}")

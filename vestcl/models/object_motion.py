@@ -1,7 +1,7 @@
 """Object-motion forecasting (OMF): how every point moves to the next frame, as a correction of the rigid flow."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 import torch
@@ -37,7 +37,8 @@ class ObjectMotionForecast(NamedTuple):
 class ObjectMotion(nn.Module):
     """A cascade of L blocks from coarse to fine: U^i = U^(i-1) + g_i dU^i, from the rigid flow U^0.
 
-    Each block sees [F, log D, M] of both frames and U^(i-1), in metres at every scale. dU starts at exactly 0.
+    Each block sees [F, log D, M] of both frames, with ``inpainted`` [F_bg, log D_bg] of both as well, and U^(i-1), in
+    metres at every scale. dU starts at exactly 0.
     g_i = 1, or with routing a Bernoulli variable of the probability that a small network gives, with the gradient
     passed straight through; outside training a rule decides, and blocks that it leaves out are not computed.
     Sizes that the scales don't divide are padded by their last rows and columns, and cut again.
@@ -49,7 +50,7 @@ class ObjectMotion(nn.Module):
         super().__init__()
         config = config or ObjectMotionConfig()
         self.config, self.scales, self.features = config, config.scales, features
-        frames = 2 * (features + 2)
+        frames = 2 * (features + 2) + (2 * (features + 1) if config.inpainted else 0)
         self.blocks = nn.ModuleList(
             MotionBlock(frames, config.shape, scale, width, config.detail)
             for scale, width in zip(config.scales, config.widths, strict=True)
@@ -70,6 +71,7 @@ class ObjectMotion(nn.Module):
         mask_cur: torch.Tensor,
         flow0: torch.Tensor,
         blocks: int | None = None,
+        backgrounds: Sequence[torch.Tensor] = (),
     ) -> ObjectMotionForecast:
         """Forecast the motion of both frames' pixels. All arguments are at the image's size, whatever that is.
 
@@ -82,14 +84,23 @@ class ObjectMotion(nn.Module):
             mask_cur: the same at t.
             flow0: [B, 6, H, W] m, the rigid flow of both frames' pixels to t + 1.
             blocks: only the first so many run, of those that routing chooses; None is all.
+            backgrounds: with ``inpainted`` features [B, features, H, W] of the background at t - 1 and at t, and its
+                depth [B, 1, H, W] m at t - 1 and at t.
 
         Returns:
             The forecast; differentiable in all arguments.
 
         Raises:
-            ValueError: an argument of another shape.
+            ValueError: an argument of another shape, or backgrounds missing or not wanted.
         """
         prev, cur = frame_pair(features_prev, features_cur, depth_prev, depth_cur, mask_prev, mask_cur, self.features)
+        if len(backgrounds) != (4 if self.config.inpainted else 0):
+            wanted = "F_bg, F_bg, D_bg, D_bg" if self.config.inpainted else "empty"
+            raise ValueError(f"`backgrounds` must be {wanted} for this configuration, got {len(backgrounds)} tensors")
+        if self.config.inpainted:
+            features, depths = backgrounds[:2], backgrounds[2:]
+            behind = frame_pair(*features, *depths, mask_prev, mask_cur, self.features)  # type: ignore[arg-type, call-arg]
+            prev, cur = prev + behind[0][:-1], cur + behind[1][:-1]
         batch, _, height, width = features_prev.shape
         check(flow0=(flow0, f"{batch} {MOTION_CHANNELS} {height} {width}"))
         frames, flow = self._pad(side_by_side([*prev, *cur])), self._pad(flow0)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vestcl import constants
 from vestcl.scene import _check
 from vestcl.scene.inpainters import Inpainter, inpainter
 from vestcl.scene.structure import structure_behind
@@ -15,8 +16,8 @@ from vestcl.scene.structure import structure_behind
 #: edge between road and houses.
 DEFAULT: Final = "regions"
 
-#: By how much what an object hides is farther than the object, at least (SPEC section 3.3).
-_BEHIND: Final = np.float32(1.01)
+#: `vestcl.constants.BEHIND`, in the depth's own type.
+_BEHIND: Final = np.float32(constants.BEHIND)
 
 #: The SPEC's dilation, px, and the width of the pictures that it is told of.
 _DILATE, _WIDTH = 10, 832

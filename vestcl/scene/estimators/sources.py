@@ -51,7 +51,13 @@ class _EstimatedFrame(Generic[Element]):
 
 
 @dataclass(frozen=True)
-class _CheckedDepth:
+class CheckedDepth:
+    """An estimator of depth that is refused if it answers with what can't be.
+
+    Args:
+        estimate: [3, H, W] RGB in [0, 1] -> [1, H, W] m, 0 = unknown.
+    """
+
     estimate: Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
     def __call__(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -59,7 +65,13 @@ class _CheckedDepth:
 
 
 @dataclass(frozen=True)
-class _CheckedClasses:
+class CheckedClasses:
+    """The same of classes.
+
+    Args:
+        estimate: [3, H, W] RGB in [0, 1] -> [1, H, W] uint8 train ids, 255 = void.
+    """
+
     estimate: Callable[[NDArray[np.float32]], NDArray[np.uint8]]
 
     def __call__(self, image: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -94,8 +106,8 @@ def with_estimates(
         A clip of the same frames. Its `read_depth` and `read_labels` raise a ValueError where an estimator answers
         with another shape or with depths or classes that can't be.
     """
-    depths = None if depth is None else _Kept(_CheckedDepth(depth))
-    classes = None if segmentation is None else _Kept(_CheckedClasses(segmentation))
+    depths = None if depth is None else _Kept(CheckedDepth(depth))
+    classes = None if segmentation is None else _Kept(CheckedClasses(segmentation))
     samples = tuple(
         replace(
             sample,
