@@ -227,6 +227,7 @@ def test_weights_of_distances(
         ("--compare --steps 1 --view 0,0,1", "`views` must have one with a truth to compare with"),
         ("--view above", "`view` must be"),
         ("--view right --view right", "got right twice"),
+        ("--perceive splatted", "`perceive` is how a network sees its own forecast; it needs `model`"),
         ("--mode feedback", "`mode` is how a network goes on after its first step; it needs `model`"),
         ("--model vest-xl", "vest-xl: is no model: no file, no checkpoint's folder, and none of vest-s"),
         ("--squeeze x.pth", "`squeeze` is a distance to the truth; it needs `compare`"),

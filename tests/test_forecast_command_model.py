@@ -2,11 +2,13 @@
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from forecast_clips import Repeater, write_clip
-from forecaster_scenes import TINY
+from forecaster_scenes import SMALL, TINY
 from stand_ins import put_module
 
 from vestcl import cli, pretrained
@@ -48,25 +50,81 @@ def test_the_network_takes_the_geometric_ones_place(
 ) -> None:
     told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1", "--frame", "3", "--no-exr"]
     assert cli.main([*told, "--model", str(file)]) == 0
-    assert f"forecast: tiny, {file}" in capsys.readouterr().out
+    assert f"forecast: tiny, {file}, mode feedback" in capsys.readouterr().out
     assert not geometric.calls
     ((model, mode),) = network.networks
     assert isinstance(model, Forecaster) and model.config == TINY and not model.training
-    assert mode == "compose"
+    assert mode == "feedback"  # it starts from rest
     saved = read_forecast(tmp_path / "out")
     settings = saved.about["settings"]
     assert saved.about["method"] == "tiny"
-    assert [settings[key] for key in ("model", "mode", "model_file")] == [str(file), "compose", str(file)]
+    assert [settings[key] for key in ("model", "mode", "model_file")] == [str(file), "feedback", str(file)]
     assert settings["model_sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
     clip: Clip = network.calls[0][0]
     assert np.array_equal(saved.image(1, "source"), clip[4].read_image())
 
 
-def test_feedback(folder: Path, tmp_path: Path, file: Path, network: Repeater, geometric: Repeater) -> None:
-    told = ["forecast", str(folder), "--out", str(tmp_path), "--no-exr", "--frame", "3", "--mode", "feedback"]
-    assert cli.main([*told, "--model", str(file)]) == 0
-    assert network.networks[0][1] == "feedback"
-    assert read_forecast(tmp_path).about["settings"]["mode"] == "feedback"
+@pytest.mark.parametrize("start", ["rest", "prior"])
+@pytest.mark.parametrize("mode", [None, "compose", "feedback"])
+def test_the_mode_of_later_frames(
+    folder: Path, tmp_path: Path, network: Repeater, geometric: Repeater, start: str, mode: str | None
+) -> None:
+    """The option's, or else what the model starts from decides; forecast.json names it."""
+    file, wanted = tmp_path / "m.safetensors", mode or {"rest": "feedback", "prior": "compose"}[start]
+    Forecaster(TINY if start == "rest" else SMALL).save(file)
+    told = ["forecast", str(folder), "--out", str(tmp_path), "--no-exr", "--frame", "3", "--model", str(file)]
+    assert cli.main([*told, *(["--mode", mode] if mode else [])]) == 0
+    assert [each[1:] for each in network.networks] == [(wanted,)]
+    settings = read_forecast(tmp_path).about["settings"]
+    assert settings["mode"] == wanted
+    assert settings["perceive"] == ("splatted" if wanted == "feedback" else None)
+
+
+def test_tables_name_the_mode(
+    folder: Path, tmp_path: Path, file: Path, network: Repeater, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = ["forecast", str(folder), "--out", str(tmp_path), "--no-exr", "--compare", "--steps", "1"]
+    assert cli.main([*told, "--model", str(file), "--mode", "compose"]) == 0
+    assert "view source, mean over 1; mode compose" in " ".join(capsys.readouterr().out.split())
+
+
+def test_estimators_see_forecast_frames(
+    folder: Path, tmp_path: Path, file: Path, network: Repeater, geometric: Repeater, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a depth model recursion estimates by default; the estimator is loaded once."""
+    loaded = []
+
+    def load(name: str) -> Any:
+        loaded.append(name)
+        return lambda image: np.full_like(image[:1], 7.0)
+
+    monkeypatch.setattr("vestcl.scene.estimators.DepthEstimator.load", load)
+    told = ["forecast", str(folder), "--no-exr", "--frame", "3", "--model", str(file), "--depth-model", "a/b"]
+    for number, options in enumerate(([], ["--perceive", "estimated"], ["--perceive", "splatted"])):
+        out = tmp_path / str(number)
+        assert cli.main([*told, "--out", str(out), *options]) == 0
+        given, perceived = network.networks[-1][1:], "splatted" if number == 2 else "estimated"
+        assert read_forecast(out).about["settings"]["perceive"] == perceived
+        assert given[0] == "feedback" and len(given) == (1 if number == 2 else 2)
+        if number < 2:
+            image, unknown = torch.rand(1, 3, 8, 12), torch.full((1, 1, 8, 12), 30.0)
+            assert (given[1](image, unknown, torch.ones_like(unknown)).depth == 7).all()
+    assert loaded == ["a/b"] * 3
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--mode", "compose", "--perceive", "splatted"], '`perceive` must not be given with mode "compose"'),
+        (["--perceive", "estimated"], '`perceive` "estimated" needs --depth-model, --mask-model or both'),
+    ],
+)
+def test_what_cannot_be_perceived(
+    folder: Path, tmp_path: Path, file: Path, options: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--model", str(file)]
+    assert cli.main([*told, *options]) == 2
+    assert words in capsys.readouterr().err
 
 
 def test_without_it_geometry_forecasts(folder: Path, tmp_path: Path, network: Repeater, geometric: Repeater) -> None:

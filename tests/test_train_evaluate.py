@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from forecaster_scenes import TINY, stir
+from forecaster_scenes import SMALL, TINY, stir
 from st_lpips_weights import public_state
 from test_train_protocols import calibration
 
@@ -91,6 +91,7 @@ def test_a_run_measures_every_method(whole: tuple[dict[str, Any], Path]) -> None
     assert difference["mean"] == pytest.approx(tiny - interval["mean"]) and difference["better"] == 0
     assert told["models"]["tiny"]["sha256"] and {"device", "torch", "vestcl"} <= set(told["machine"])
     assert "Depth is from the street itself, true, masks are from labels." in told["notes"]
+    assert told["models"]["tiny"]["mode"] == "feedback"  # it starts from rest
 
 
 def test_the_files_tell_the_same(whole: tuple[dict[str, Any], Path]) -> None:
@@ -106,6 +107,7 @@ def test_the_files_tell_the_same(whole: tuple[dict[str, Any], Path]) -> None:
     text = (out / "results.md").read_text(encoding="utf-8")
     best = told["summary"]["source"]["tiny"]["by_horizon"]["psnr"]
     assert f"| tiny | {best[0]:.2f} | {best[1]:.2f} |" in text
+    assert ", mode feedback" in text and text.count("Mode of later frames: tiny feedback.") >= 6
     assert "view source, model less geometric" in text and "view camera, model less constant velocity" in text
     assert "by clip" in text and "| street 4 | 1 |" in text and "LPIPS (--lpips), ST-LPIPS (--st-lpips)" in text
     sheets = [read_pixels(out / f"sheet_{word}.png") for word in ("best", "median", "worst")]
@@ -216,6 +218,7 @@ def test_the_present_from_the_right(tmp_path: Path, model: Path) -> None:
     assert set(present) == {AS_SEEN, GEOMETRIC, "tiny"} and len(present[GEOMETRIC]["by_horizon"]["ssim"]) == 1
     assert present[GEOMETRIC]["by_horizon"]["psnr"][0] > present[AS_SEEN]["by_horizon"]["psnr"][0]
     assert "tiny" in told["summary"]["source"]
+    assert not any("Mode compose" in note for note in told["notes"])
     text = (tmp_path / "out" / "results.md").read_text(encoding="utf-8")
     assert "view right at t" in text and "Depth is from motion, masks are from motion." in text
     assert "compute_scores.py): the outer 5 % of each side are black" in text
@@ -262,6 +265,21 @@ def test_other_frames_of_a_clip_are_no_overlap(tmp_path: Path) -> None:
         part = evaluate_windows.Part(Source("street 3", Street.generate), (index,), tmp_path / "part")
         leaks, unknown = training_overlap([tmp_path / "a.safetensors"], [part], 2)
         assert bool(leaks) == overlaps and unknown == ()
+
+
+def test_each_model_makes_later_frames_as_it_is_meant_to(tmp_path: Path) -> None:
+    """A setting overrides that, and where it is not the paper's way, a caveat says so."""
+    for name, kind in (("rest", TINY), ("prior", SMALL)):
+        Forecaster(kind).save(tmp_path / f"{name}.safetensors")
+    models = tuple(tmp_path / f"{name}.safetensors" for name in ("rest", "prior"))
+    wanted = {None: ("feedback", "compose"), "compose": ("compose",) * 2, "feedback": ("feedback",) * 2}
+    for mode, modes in wanted.items():
+        config = Evaluation("kitti-prediction", model=models, mode=mode)  # type: ignore[arg-type]
+        setup = evaluate.setup_of(config, evaluate.protocol_of(config))
+        assert tuple(setup.modes.values()) == modes
+        composed = [name for name, own in setup.modes.items() if own == "compose"]
+        caveats = [note for note in evaluate._caveats(config, setup) if note.startswith("Mode compose")]
+        assert len(caveats) == bool(composed) and all(", ".join(composed) in note for note in caveats)
 
 
 # ---------------------------------------------------------------- the command line

@@ -26,6 +26,15 @@ def results(*more: Record, protocol: Protocol = PROTOCOLS["kitti-space"]) -> Res
     return Results(protocol, records, (1, 3), ("ours",), ("Told.",))
 
 
+def test_tables_name_how_models_made_later_frames() -> None:
+    named = dataclasses.replace(results(), modes={"ours": "feedback"})
+    for make in (grids, short_grids):
+        own = [grid for grid in make(named) if not grid.title.endswith("the paper")]
+        assert own and all(grid.notes[-1] == "Mode of later frames: ours feedback." for grid in own)
+        assert all(sum("Mode of" in note for note in grid.notes) == 1 for grid in own)
+    assert not any("Mode of" in note for grid in grids(results()) for note in grid.notes)
+
+
 def find(made: list[Grid], title: str) -> Grid:
     (grid,) = [grid for grid in made if grid.title == f"{NAME}, {title}"]
     return grid

@@ -104,8 +104,9 @@ class Evaluation:
     """The first current frame t of a clip, from 0; without it the protocol's."""
     last: int | None = None
     """The last one."""
-    mode: Mode = "compose"
-    """How models make steps after the first: compose the first motion, or feed each forecast frame back."""
+    mode: Mode | None = None
+    """How models make steps after the first: compose the first motion, or feed each forecast frame back (feedback).
+    Without it each as it is meant to: feedback for models that start from rest, compose for vest-s."""
     stereo: bool = False
     """Take depth from stereo pairs even where clips have depth (laser scans, or a street's true depth). Rows that do
     end in "stereo pair"; where the right camera's future is judged they come next to monocular ones."""
@@ -166,8 +167,10 @@ def evaluate(config: Evaluation) -> None:
         first = prepared(sources[0].opens(), setup)
         notes = (known_of(first, depths(first, protocol, config.stereo)), *_caveats(config, setup))
         leaks, unknown = training_overlap(config.model, parts, setup.steps)
-        results = report.Results(protocol, records, protocol.shown, tuple(setup.models), notes + unknown, leaks)
-        _write(out, results, about | {"machine": _results.describe(session)}, console)
+        names = tuple(setup.models)
+        results = report.Results(protocol, records, protocol.shown, names, notes + unknown, leaks, setup.modes)
+        models = {name: told | {"mode": setup.modes[name]} for name, told in about["models"].items()}
+        _write(out, results, about | {"models": models, "machine": _results.describe(session)}, console)
         if config.sheets:
             _sheets(out, sources, setup, results, console)
 
@@ -267,6 +270,9 @@ def _caveats(config: Evaluation, setup: Setup) -> list[str]:
     changed = [f"{name} {getattr(protocol, name)}" for name in _PUBLISHED
                if getattr(protocol, name) != getattr(default, name)]  # fmt: skip
     changed += [f"every {config.every}"] if config.every > 1 else []
+    composed = [name for name, mode in setup.modes.items() if mode == "compose"]
+    if default.paper and composed and protocol.steps > 1:
+        told.append(f"Mode compose, where the paper's models forecast recursively (feedback): {', '.join(composed)}.")
     if default.paper and changed:
         told.append(f"Not the published protocol: {', '.join(changed)}.")
     return told + [NOW_NOTE] * protocol.now
@@ -290,7 +296,7 @@ def _run(parts: Sequence[Part], setup: Setup, console: Console) -> None:
 
 def _write(out: Path, results: report.Results, about: dict[str, Any], console: Console) -> None:
     machine = about["machine"]
-    models = [f"{name}: sha256 {told['sha256'][:16]}" for name, told in about["models"].items()]
+    models = [f"{name}: sha256 {told['sha256'][:16]}, mode {told['mode']}" for name, told in about["models"].items()]
     lines = [f"vestcl {__version__}, {machine['device']}, {machine['cores']} cores, {machine['date']}", *models]
     settings = ", ".join(f"{name} {value}" for name, value in about["settings"].items() if value is not None)
     for grid in report.short_grids(results):

@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
 from train.evaluate_inputs import label_of, plain
@@ -55,6 +55,8 @@ class Results:
     """What was given to methods and what was not measured, a sentence each."""
     leaks: tuple[str, ...] = ()
     """Which models were trained on what is evaluated, a sentence each: notes of every table."""
+    modes: Mapping[str, str] = field(default_factory=dict)
+    """How each model made the steps after the first, as notes below tables name it."""
 
     def is_model(self, method: str) -> bool:
         """Whether a row is a model's, with whatever label."""
@@ -80,27 +82,30 @@ def grids(results: Results) -> list[Grid]:
     """All tables: by horizon, differences, the paper's, running means, intervals, by clip."""
     name, records, horizons = results.protocol.title, results.records, results.horizons
     pictures = [record for record in records if record.first == 1 and "psnr" in record.scores]
-    made = [
-        *short_grids(results),
+    further = [
         *picture_grids(name, pictures, [k for k in horizons if k > 1], running=True),
         *(_interval_grid(view, of_view, results) for view, of_view in by_view(records).items()),
         *_clip_grids(results),
     ]
-    return [_with_leaks(grid, results) for grid in made]
+    return [*short_grids(results), *(_with_notes(grid, results) for grid in further)]
 
 
 def short_grids(results: Results) -> list[Grid]:
     """Those that a terminal has room for: by horizon, differences, the paper's."""
     name = results.protocol.title
     shown = picture_grids(name, results.records, results.horizons)
-    return [_with_leaks(grid, results) for grid in (*shown, *_difference_grids(results))] + _paper_grids(results)
+    own = [_with_notes(grid, results) for grid in (*shown, *_difference_grids(results))]
+    return own + _paper_grids(results)
 
 
-def _with_leaks(grid: Grid, results: Results) -> Grid:
-    """The table with the sentences on models that were trained on what is evaluated, once."""
+def _with_notes(grid: Grid, results: Results) -> Grid:
+    """With a note on how the models made later frames, and the sentences on models that were trained on what is
+    evaluated, once."""
+    named = ", ".join(f"{model} {mode}" for model, mode in results.modes.items())
+    modes = (f"Mode of later frames: {named}.",) if named else ()
     is_paper = grid.title.endswith(_PAPER)
     missing = () if is_paper else tuple(leak for leak in results.leaks if leak not in grid.notes)
-    return replace(grid, notes=(*grid.notes, *missing))
+    return replace(grid, notes=(*grid.notes, *modes, *missing))
 
 
 def _interval_grid(view: str, records: Sequence[Record], results: Results) -> Grid:

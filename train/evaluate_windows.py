@@ -68,7 +68,8 @@ class Setup:
     steps: int
     models: Mapping[str, Forecaster]
     """By the name that tables give them."""
-    mode: Mode = "compose"
+    mode: Mode | None = None
+    """How models make steps after the first; None is each one's default."""
     stereo: bool = False
     """Depth from the stereo pair although the clip has depth, see `train.evaluate_inputs.depths`."""
     trunk: Trunk | None = None
@@ -77,6 +78,11 @@ class Setup:
     st_lpips: StLpips | None = None
     peer: VoxelFlowNetwork | None = None
     """The learned 2D baseline, `vestcl.peer`."""
+
+    @property
+    def modes(self) -> dict[str, Mode]:
+        """How each model makes steps after the first."""
+        return {name: self.mode or model.config.default_mode for name, model in self.models.items()}
 
 
 @dataclass(frozen=True)
@@ -243,7 +249,7 @@ def forecast(perception: Perception, index: int, views: Sequence[View], setup: S
         made[peer.METHOD] = Timed(flat, seconds + ("geometry" in flat.seconds) * looking)
     for name, model in setup.models.items():
         seen = (perception, model, index, setup.steps, views)
-        own, seconds = _timed(functools.partial(network.forecast_frames, *seen, mode=setup.mode))
+        own, seconds = _timed(functools.partial(network.forecast_frames, *seen, mode=setup.modes[name]))
         made[name] = Timed(own, looking + seconds)
     return made
 

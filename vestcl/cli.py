@@ -125,7 +125,11 @@ class Forecast:
     model: str | None = None
     """Forecast by a network: vest-s, a .safetensors file, a training checkpoint's folder. Without it: by geometry."""
     mode: Literal["compose", "feedback"] | None = None
-    """With --model: repeat the first step's motion (compose, which is usual), or see each forecast frame (feedback)."""
+    """With --model: repeat the first step's motion (compose), or see each forecast frame (feedback). Without it: as the
+    model is meant to, which is feedback for models that start from rest, and compose for vest-s."""
+    perceive: Literal["splatted", "estimated"] | None = None
+    """With mode feedback: depth and mask of forecast frames are splatted, or estimated by --depth-model and
+    --mask-model. Without it: estimated where one of these is given, else splatted."""
     quality: Literal["exact", "balanced", "fast"] | None = None
     """With --model: balanced (usual) is within 0.1 dB of exact in PSNR, fast not; docs/time_against_error has both."""
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = ()

@@ -91,7 +91,8 @@ def run(
         scores = {view.name: _scores(forecasts, truth[view.name], clip, index, view) for view in views}
         sheets = {view.name: sheet.forecast_sheet([frame[view.name] for frame in forecast.frames]) for view in views}
         settings: dict[str, Any] = {"height": height, "width": width, "model": name}
-        settings |= {} if forecaster is None else {**pretrained.about_model(name), **quality.about(level)}
+        if forecaster is not None:
+            settings |= {"mode": forecaster.config.default_mode, **pretrained.about_model(name), **quality.about(level)}
         about = forecast_files.Details(f"street:{seed}", settings, scores, sheets)
         forecast_files.write_forecast(out, forecast, seen, index, views, about)
         write_pixels(out / "sheet.png", _sheet(perception, index, forecast, truth))

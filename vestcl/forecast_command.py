@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rich import box
 from rich.console import Console
@@ -21,6 +21,7 @@ from vestcl.compare import Comparison
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Skipped, View
+from vestcl.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
 from vestcl.models.trunks import load_trunk
 from vestcl.perceptual import StLpips
 from vestcl.progress import Bar
@@ -36,9 +37,6 @@ STREET: Final = re.compile(r"street:(\d+)")
 #: Frames of a street up to the current one where ``frame`` is not told, and its size in pixels: SPEC section 10.
 STREET_CONTEXT: Final = 4
 STREET_SIZE: Final = (256, 832)
-
-#: How a network goes on after its first step: this way its forecast takes least time.
-USUAL_MODE: Final[Literal["compose", "feedback"]] = "compose"
 
 #: Steps in a table of scores, so that it fits 80 letters; forecast.json has all.
 STEPS_SHOWN: Final = 5
@@ -89,12 +87,14 @@ def run(options: "cli.Forecast") -> None:
         with stages.stage("open the clip"):
             level = options.quality or quality.USUAL
             model = None if options.model is None else quality.load(options.model, level)
-            clip = open_clip(options)
+            estimators = load_estimators(options)
+            clip = open_clip(options, estimators)
+            later = None if model is None else later_frames(model.config, options.mode, options.perceive, *estimators)
             index = current_frame(clip, options)
             views = parse_views(options.view or ("source",), clip[index])
             trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
             st_lpips = None if options.st_lpips is None else StLpips.load(options.st_lpips)
-        forecast = _forecast(clip, index, options, views, stages, model)
+        forecast = _forecast(clip, index, options, views, stages, model, later)
         stages.seconds |= forecast.seconds
         comparisons = []
         if options.compare:
@@ -105,17 +105,28 @@ def run(options: "cli.Forecast") -> None:
                     rivals = compare.compare(rival, clip, index, views, trunk, st_lpips=st_lpips)
                     comparisons = [_beside(*pair, rival.method) for pair in zip(comparisons, rivals, strict=True)]
         with stages.stage(forecast_files.WRITING) as report:
-            details = _details(options, clip, index, forecast, comparisons)
+            details = _details(options, clip, index, forecast, comparisons, later)
             told = dataclasses.replace(forecast, seconds=dict(stages.seconds))
             write = functools.partial(forecast_files.write_forecast, exr=options.exr, gif=options.gif, report=report)
             write(options.out, told, clip, index, views, details)
     for comparison in comparisons:
-        console.print(_score_table(comparison))
+        console.print(_score_table(comparison, later))
     _print_end(console, forecast_files.read_forecast(options.out))
 
 
-def open_clip(options: "cli.Forecast") -> Clip:
-    """The clip that the options tell, at the size they tell, with estimators in place of what they replace.
+class Estimators(NamedTuple):
+    """What estimates depth and classes of a frame; None where nothing is to."""
+
+    depth: DepthOf | None
+    segmentation: ClassesOf | None
+
+
+def open_clip(options: "cli.Forecast", estimators: Estimators | None = None) -> Clip:
+    """The clip that the options name, at the size they give, with estimators in place of what they replace.
+
+    Args:
+        options: of the command.
+        estimators: of the same options; None loads them.
 
     Raises:
         ValueError: as `vestcl.data.open.open_sequence`; an option that a street does not have; an estimator whose
@@ -128,9 +139,9 @@ def open_clip(options: "cli.Forecast") -> Clip:
         wrong = [*layout, *(name for name, unset in _BESIDE.items() if beside[name] != unset)]
         if wrong:
             raise ValueError(f"{options.input}: is a street, which takes height and width, not {', '.join(wrong)}")
-        return _with_estimates(_street(int(street[1]), options), options)
-    clip = open_sequence(options.input, **beside, **layout)
-    return _with_estimates(_resized(clip, options.height, options.width), options)
+        return _with_estimates(_street(int(street[1]), options), estimators or load_estimators(options))
+    clip = _resized(open_sequence(options.input, **beside, **layout), options.height, options.width)
+    return _with_estimates(clip, estimators or load_estimators(options))
 
 
 def current_frame(clip: Clip, options: "cli.Forecast") -> int:
@@ -172,6 +183,8 @@ def _check(options: "cli.Forecast") -> None:
             raise ValueError(f"`{name}` is a distance to the truth; it needs `compare`")
     if options.mode is not None and options.model is None:
         raise ValueError("`mode` is how a network goes on after its first step; it needs `model`")
+    if options.perceive is not None and options.model is None:
+        raise ValueError("`perceive` is how a network sees its own forecast; it needs `model`")
     if options.quality is not None and options.model is None:
         raise ValueError("`quality` is how exactly a network computes; it needs `model`")
 
@@ -198,9 +211,14 @@ def _resized(clip: Clip, height: int | None, width: int | None) -> Clip:
     return clip.resized(height, width)
 
 
-def _with_estimates(clip: Clip, options: "cli.Forecast") -> Clip:
+def load_estimators(options: "cli.Forecast") -> Estimators:
+    """The estimators that the options name.
+
+    Raises:
+        ValueError: an estimator whose package or checkpoint is not there.
+    """
     if options.depth_model is None and options.mask_model is None:
-        return clip
+        return Estimators(None, None)
     from vestcl.scene import estimators
 
     try:
@@ -208,7 +226,15 @@ def _with_estimates(clip: Clip, options: "cli.Forecast") -> Clip:
         classes = None if options.mask_model is None else estimators.SegmentationEstimator.load(options.mask_model)
     except ImportError as error:  # of the optional package; its message tells how to get it
         raise ValueError(str(error)) from error
-    return estimators.with_estimates(clip, depth=depth, segmentation=classes)
+    return Estimators(depth, classes)
+
+
+def _with_estimates(clip: Clip, given: Estimators) -> Clip:
+    if given == Estimators(None, None):
+        return clip
+    from vestcl.scene import estimators
+
+    return estimators.with_estimates(clip, depth=given.depth, segmentation=given.segmentation)
 
 
 def _forecast(
@@ -218,17 +244,21 @@ def _forecast(
     views: list[View],
     stages: _Stages,
     model: "Forecaster | None" = None,
+    later: LaterFrames | None = None,
 ) -> Forecast:
     """By the network, or without one the geometric forecast."""
     stages.show("forecast", 0.0)
     asked = clip, index, options.steps, views
-    if model is None:
+    if model is None or later is None:
         from vestcl import geometric
 
         return geometric.forecast_clip(*asked, progress=stages.show)
     from vestcl import network
 
-    return network.forecast_clip(*asked, model, mode=options.mode or USUAL_MODE, progress=stages.show)
+    how: dict[str, Any] = {"mode": later.mode}
+    if later.perceive is not None:
+        how["perceive"] = later.perceive
+    return network.forecast_clip(*asked, model, progress=stages.show, **how)
 
 
 def _beside(comparison: Comparison, rival: Comparison, method: str) -> Comparison:
@@ -240,7 +270,12 @@ def _beside(comparison: Comparison, rival: Comparison, method: str) -> Compariso
 
 
 def _details(
-    options: "cli.Forecast", clip: Clip, index: int, forecast: Forecast, comparisons: list[Comparison]
+    options: "cli.Forecast",
+    clip: Clip,
+    index: int,
+    forecast: Forecast,
+    comparisons: list[Comparison],
+    later: LaterFrames | None,
 ) -> forecast_files.Details:
     """What forecast.json tells, and a sheet a view: beside the truth where it is known."""
     what = f"{clip.name}, {forecast.method} forecast from frame {clip[index].name}, view "
@@ -253,18 +288,19 @@ def _details(
     }
     scores = {name: comparison.scores for name, comparison in compared.items()} if options.compare else None
     settings = dataclasses.asdict(options)
-    if options.model is not None:
-        chosen = {"mode": options.mode or USUAL_MODE, **quality.about(options.quality or quality.USUAL)}
+    if options.model is not None and later is not None:
+        chosen = {**later.settings, **quality.about(options.quality or quality.USUAL)}
         settings |= chosen | pretrained.about_model(options.model)
     return forecast_files.Details(options.input, settings, scores, sheets)
 
 
-def _score_table(comparison: Comparison) -> Table:
+def _score_table(comparison: Comparison, later: LaterFrames | None) -> Table:
     """A block of rows a metric, a row a method, a column a step: the first, the last and some between."""
     count = len(comparison.truth)
     shown = sorted({round(1 + (count - 1) * part / (STEPS_SHOWN - 1)) for part in range(STEPS_SHOWN)})
     note = "; baselines: the right camera's own past" if comparison.stereo else ""
-    title = f"view {comparison.view}, mean over {count}{note}"
+    mode = "" if later is None else f"; mode {later}"
+    title = f"view {comparison.view}, mean over {count}{mode}{note}"
     table = Table(box=box.SIMPLE, title=title, title_justify="left", pad_edge=False)
     table.add_column("", no_wrap=True)
     for heading in (*(f"t+{step}" for step in shown), "mean"):
@@ -283,7 +319,9 @@ def _score_table(comparison: Comparison) -> Table:
 
 def _print_end(console: Console, saved: forecast_files.SavedForecast) -> None:
     file = saved.about["settings"].get("model_file")
-    console.print(Text(f"forecast: {saved.about['method']}" + (f", {file}" if file else "")), soft_wrap=True)
+    mode = saved.about["settings"].get("mode")
+    told = [saved.about["method"], *([file] if file else []), *([f"mode {mode}"] if mode else [])]
+    console.print(Text(f"forecast: {', '.join(told)}"), soft_wrap=True)
     seconds: dict[str, float] = saved.about["seconds"]
     table = Table("stage", box=box.SIMPLE)
     table.add_column("seconds", justify="right")
