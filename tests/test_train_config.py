@@ -221,7 +221,9 @@ def test_configurations_are_frozen(small: Path) -> None:
 
 def test_the_shipped_ones_are_there() -> None:
     sets = {f"{model}_{data}" for model in ("vest-s", "vest-paper") for data in ("street", "kitti", "cityscapes")}
-    assert {path.stem for path in CONFIGS} == sets | {"vest-paper_kitti-views", "vest-s_kitti-clip", "ablation_street"}
+    variants = {f"{name}_{kind}" for name in sets if "paper" in name for kind in ("two-stages", "mirrored")}
+    more = {"vest-paper_kitti-views", "vest-s_kitti-clip", "ablation_street"}
+    assert {path.stem for path in CONFIGS} == sets | variants | more
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
@@ -253,4 +255,18 @@ def test_the_papers_settings(path: Path) -> None:
     assert {stage.learning_rate for stage in config.stages} == {1e-4} and {s.batch for s in config.stages} == {4}
     assert config.loss.l1 == config.loss.perceptual.weight == 1 and config.loss.perceptual.kind == "vgg19"
     assert not any((config.loss.ssim, config.loss.residual_motion, *dataclasses.astuple(config.loss.pose)))
-    assert "object_motion" not in config.stages[0].train and len(config.stages[-1].train) == 4
+    assert config.model == "vest-paper" and len(config.stages[-1].train) == 4
+    assert config.data.crop is None and config.data.scale == (1, 1) and not config.data.colour
+    assert config.data.flip == path.stem.endswith("mirrored")
+    stages = [stage.name for stage in config.stages]
+    assert stages == (["ego", "all"] if path.stem.endswith("two-stages") else ["all"])
+    windows = {"street": 400, "kitti": 6894, "cityscapes": 2975}[path.stem.split("_")[1]]
+    assert config.steps == 300 * windows // 4
+
+
+def test_the_encoders_public_weights_are_a_key() -> None:
+    (path,) = [path for path in CONFIGS if path.stem == "vest-paper_street"]
+    assert load_config(path, OPEN).init_encoder is None
+    assert load_config(path, (*OPEN, "init_encoder=resnet34.pth")).init_encoder == Path("resnet34.pth")
+    words = error_of(path, *OPEN, "init_encoder=resnet34.pth", "init=model.safetensors")
+    assert "`init_encoder` must be null with `init`" in words

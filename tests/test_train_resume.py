@@ -1,5 +1,6 @@
 """What of a configuration may change when a run goes on, and what is said of the rest."""
 
+import copy
 import dataclasses
 from typing import Any
 
@@ -51,6 +52,17 @@ def test_what_may_not(step: int, changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError) as caught:  # noqa: PT011 - its words are what is tested
         check_resume(state_of(step), configured(**changes))
     assert words in str(caught.value)
+
+
+def test_keys_that_came_later_have_their_defaults() -> None:
+    """A checkpoint that was written before `loss.routing` and `init_encoder` goes on."""
+    state = state_of(12)
+    settings = copy.deepcopy(dict(state.config))
+    del settings["init_encoder"], settings["loss"]["routing"]
+    check_resume(dataclasses.replace(state, config=settings), configured())
+    changed = configured(loss={**SETTINGS["loss"], "routing": 0.5})
+    with pytest.raises(ValueError, match=r"`loss\.routing` was 1\.0, is 0\.5"):
+        check_resume(dataclasses.replace(state, config=settings), changed)
 
 
 def test_all_that_differs_is_named() -> None:

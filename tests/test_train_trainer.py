@@ -1,13 +1,15 @@
 """train.trainer: one stage's updates, by hand where they can be."""
 
 import copy
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from forecaster_scenes import SMALL, stir
+from forecaster_scenes import OBJECTS, SMALL, stir
+from test_encoder import resnet34
 from torch import nn
 from train_scenes import MODELS, configured, street
 
@@ -17,7 +19,8 @@ from train.data import Batch, loader
 from train.fit import window_set
 from train.ranks import Ranks
 from train.trainer import Average, NotANumberError, Trainer, build_model, choose_parts, learning_rate_factor
-from vestcl.models import config
+from vestcl.models import Encoder, ObjectMotion, config, load_resnet34
+from vestcl.models.config import RoutingConfig
 from vestcl.models.forecaster import Forecaster
 
 PARTS = ("encoder", "ego_motion", "object_motion", "refine")
@@ -218,3 +221,60 @@ def test_no_number_leaves_the_weights(
         assert updates.update(batch).skipped
         assert updates.schedule.last_epoch == 2
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+# ---------------------------------------------------------------- routing, public weights, the recording car
+
+
+def test_routing_trains_with_its_budget(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With nothing else to learn from, the expected number of blocks goes to the budget."""
+    objects = dataclasses.replace(OBJECTS, routing=RoutingConfig(4, budget=0.5))
+    monkeypatch.setattr(config, "CONFIGS", {**MODELS, "routed": dataclasses.replace(SMALL, object_motion=objects)})
+    loss, stage = {"l1": 0.0, "ssim": 0.0, "pose": {}}, {"learning_rate": 0.2}
+    settings = one_stage(cache, tmp_path, steps=12, model="routed", loss=loss, stage=stage)
+    model = build_model(settings)
+    assert isinstance(model.object_motion, ObjectMotion) and model.object_motion.routing is not None
+    nn.init.constant_(model.object_motion.routing.choose.bias, 2.0)
+    nn.init.zeros_(model.object_motion.routing.choose.weight)
+    updates, batch = trained(settings, model), batch_of(settings)
+    found = [updates.update(batch).terms["routing"] for _ in range(12)]
+    expected = 2 / (1 + math.exp(-2.0))
+    assert found[0] == pytest.approx(((expected - 0.5) / 2) ** 2, rel=1e-4)
+    assert found[-1] < found[0] / 3
+
+
+def test_models_without_routing_have_no_such_term(cache: Path, tmp_path: Path) -> None:
+    settings = one_stage(cache, tmp_path)
+    assert "routing" not in trained(settings, stirred()).update(batch_of(settings)).terms
+
+
+def test_the_encoder_starts_from_public_weights(cache: Path, tmp_path: Path) -> None:
+    """Of `init_encoder` the stem and layers; all else as without it."""
+    torch.manual_seed(1)
+    torch.save(resnet34(), tmp_path / "resnet34.pth")
+    plain = one_stage(cache, tmp_path, model="vest-paper")
+    given = build_model(dataclasses.replace(plain, init_encoder=tmp_path / "resnet34.pth"))
+    encoder, wanted = Encoder(), Encoder()
+    load_resnet34(wanted, tmp_path / "resnet34.pth")
+    without = build_model(plain)
+    trunk = ("conv1.", "norm1.", "layer1.", "layer2.", "layer3.")
+    for name in encoder.state_dict():
+        source = wanted if name.startswith(trunk) else without.encoder
+        assert torch.equal(given.encoder.state_dict()[name], source.state_dict()[name]), name
+    assert torch.equal(given.refine.out.weight, without.refine.out.weight)
+
+
+def test_public_weights_of_another_encoder_are_refused(cache: Path, tmp_path: Path) -> None:
+    torch.save(resnet34(), tmp_path / "resnet34.pth")
+    settings = one_stage(cache, tmp_path, model="vest-s", init_encoder=str(tmp_path / "resnet34.pth"))
+    with pytest.raises(ValueError, match="`init_encoder` must hold ResNet34's weights for vest-s"):
+        build_model(settings)
+
+
+def test_the_network_is_given_the_recording_car(cache: Path, tmp_path: Path) -> None:
+    settings, model, seen = one_stage(cache, tmp_path), stirred(), []
+    model.register_forward_pre_hook(lambda _model, _inputs, named: seen.append(named["own"]), with_kwargs=True)
+    batch = batch_of(settings)
+    assert batch.own is not None and batch.own.shape == batch.frame_cur.mask.shape
+    trained(settings, model).update(batch)
+    assert seen[0] is batch.own

@@ -113,6 +113,8 @@ class LossConfig:
     pose: PoseConfig = PoseConfig()
     residual_motion: Weight = 0.0
     """Of how far object motion strays from the rigid flow, relative to depth."""
+    routing: Weight = 1.0
+    """Of models with +routing: `vestcl.models.budget_loss`, so that its budget of blocks runs on average."""
 
 
 @dataclass(frozen=True, config=RULES)
@@ -194,6 +196,8 @@ class Config:
     """A name that `vestcl.models.configuration` knows, with its variants ("vest-s+no-omf")."""
     init: Path | None = None
     """A model's file to start from; null starts from random weights."""
+    init_encoder: Path | None = None
+    """A ResNet34's file (torchvision's names, trained on ImageNet) for the encoder's stem and layers to start from."""
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**63)] = 0
     optimiser: OptimiserConfig = OptimiserConfig()
     run: RunConfig = RunConfig()
@@ -203,6 +207,8 @@ class Config:
             model = configuration(self.model)
         except ValueError as error:
             raise ValueError(f"`model`: {error}") from error
+        if self.init is not None and self.init_encoder is not None:
+            raise ValueError("`init_encoder` must be null with `init`, which holds the encoder's weights, too")
         names = [stage.name for stage in self.stages]
         if not names or len(set(names)) < len(names):
             raise ValueError(f"`stages` must be one or more, of different names, got {names}")

@@ -54,6 +54,8 @@ class Batch(NamedTuple):
     """[B] bool: where it is."""
     clips: tuple[str, ...]
     """"clip name/name of frame t" of each window."""
+    own: torch.Tensor | None = None
+    """[B, 1, H, W], 1 where the recording car itself is in the input images; None is nowhere."""
 
 
 class Draw(NamedTuple):
@@ -174,8 +176,9 @@ class WindowSet:
         made = [self._made(draw) for draw in draws]
         inputs, windows = [given for given, _ in made], [window for _, window in made]
         poses = [window.future_from_cur for window in windows]
+        given = joined(inputs)
         return Batch(
-            *joined(inputs),
+            *given[:4],
             draws[0].horizon,
             torch.from_numpy(np.stack([window.target for window in windows])),
             _matrices([window.tgt_from_next for window in windows]),
@@ -184,6 +187,7 @@ class WindowSet:
             torch.stack([self._path(window) for window in windows]),
             torch.tensor([bool(window.path_from_cur) for window in windows]),
             tuple(self.label(draw) for draw in draws),
+            given.own,
         )
 
     def window(self, draw: Draw) -> Window:

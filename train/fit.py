@@ -32,6 +32,7 @@ from train.trainer import Average, NotANumberError, Trainer, build_model
 from vestcl import runtime
 from vestcl.data.splits import KITTI_TRAINING
 from vestcl.models._checkpoint import Frames, read_trained_on
+from vestcl.models._weights import misfit
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepared import find_prepared
 
@@ -220,6 +221,9 @@ class _Run:
             self.report.say(f"step {self.step}: {error}", "red")
 
     def _restore(self, state: State) -> None:
+        if reason := misfit(state.model, self.model.state_dict()):
+            model = self.config.model
+            raise ValueError(f"the checkpoint of step {state.step} holds another model than {model}: it {reason}")
         self.step, self.trained_on = state.step, merged(self.trained_on, state.trained_on)
         self.model.load_state_dict(dict(state.model))
         if self.average and state.ema is not None:

@@ -1,8 +1,8 @@
 """What training minimises: the image against the truth, and how far the motion is from what is known of it.
 
-Each term is a mean over the samples of a batch, so that processes which share a batch out and average their gradients
-get the gradient of the whole. Images are compared as they come, without clamping to [0, 1]: a clamp's gradient is 0
-just where it is needed, and every term is defined beyond.
+Each term but routing's is a mean over the samples of a batch, so that processes which share a batch and average their
+gradients get the gradient of the whole. Images are compared as they come, without clamping to [0, 1]: a clamp's
+gradient is 0 just where it is needed, and every term is defined beyond.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from torch.nn import functional
 from train.config import LossConfig
 from train.data import Batch
 from vestcl import metrics
+from vestcl.models import budget_loss
 from vestcl.models._layers import check
 from vestcl.models.forecaster import RenderedView, Step
 from vestcl.models.trunks import load_trunk
@@ -52,7 +53,12 @@ def build_perceptual(config: LossConfig) -> Perceptual | None:
 
 
 def total_loss(
-    view: RenderedView | None, step: Step, batch: Batch, config: LossConfig, perceptual: Perceptual | None
+    view: RenderedView | None,
+    step: Step,
+    batch: Batch,
+    config: LossConfig,
+    perceptual: Perceptual | None,
+    budget: float | None = None,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """sum_i w_i term_i, over the terms of weight above 0.
 
@@ -62,6 +68,7 @@ def total_loss(
         rotation         `path_errors`, rad; weight ``pose.rotation``
         translation      `path_errors`, m; weight ``pose.translation``
         residual_motion  `residual_motion`
+        routing          `vestcl.models.budget_loss`, of models that route
 
     Args:
         view: the forecast in the target's camera, B images; None leaves out the terms of images.
@@ -69,6 +76,7 @@ def total_loss(
         batch: what was shown, and the truth.
         config: weights w.
         perceptual: from `build_perceptual` of the same configuration.
+        budget: blocks of object motion that should run on average; None for models that run all.
 
     Returns:
         The sum, differentiable in the view's image and in the step's motion, and each term before its weight,
@@ -84,6 +92,9 @@ def total_loss(
         "translation": (config.pose.translation, translation),
         "residual_motion": (config.residual_motion, residual_motion(step, batch)),
     }
+    probabilities = step.motion.objects.probabilities
+    if budget is not None and probabilities is not None and view is not None:
+        terms["routing"] = config.routing, budget_loss(probabilities, budget)
     counted = [weight * term for weight, term in terms.values() if weight]
     total = torch.stack(counted).sum() if counted else rotation.new_zeros(())
     return total, {name: term.detach() for name, (_, term) in terms.items()}

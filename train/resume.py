@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from train.checkpoint import State, package_versions
-from train.config import Config, to_dict
+from train.config import Config, from_dict, to_dict
 
 #: Keys that may change on the way: none of them is a part of what was learnt so far.
 _FREE: Final = re.compile(r"((run|out|data\.workers|stages\.\d+\.data\.workers)(\.|$))")
@@ -28,7 +28,7 @@ def check_resume(state: State, config: Config) -> None:
         ValueError: something else differs; the message says which keys, what they were and what they are. Or what is
             done of a stage is more than it is to have.
     """
-    then, now = dict(_flat(state.config)), dict(_flat(to_dict(config)))
+    then, now = dict(_flat(_completed(state.config))), dict(_flat(to_dict(config)))
     ends = _ends(state.config)
     changed = [
         f"  `{key}` was {then.get(key)!r}, is {now.get(key)!r}"
@@ -44,6 +44,14 @@ def check_resume(state: State, config: Config) -> None:
     if other := [f"{name} {old} -> {versions.get(name)}" for name, old in state.versions.items()
                  if versions.get(name) != old]:  # fmt: skip
         warnings.warn(f"the checkpoint was written with other versions: {', '.join(other)}", stacklevel=2)
+
+
+def _completed(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """With the defaults of keys that came after the checkpoint was written; as it is where it is not valid any more."""
+    try:
+        return to_dict(from_dict(settings))
+    except ValueError:
+        return settings
 
 
 def _may_change(key: str, step: int, ends: list[int]) -> bool:

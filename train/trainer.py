@@ -16,6 +16,7 @@ from train.losses import Perceptual, total_loss
 from train.ranks import Ranks
 from vestcl import runtime
 from vestcl.models.config import ModelConfig, configuration
+from vestcl.models.encoder import load_resnet34
 from vestcl.models.forecaster import Forecaster, RenderedView, Step
 
 _PRECISIONS: Final = {"float32": None, "bfloat16": torch.bfloat16}
@@ -40,10 +41,10 @@ class Update:
 
 
 def build_model(config: Config) -> Forecaster:
-    """The model that ``config`` names: random weights by its seed, or those of its ``init``.
+    """The model that ``config`` names: random weights by its seed, those of its ``init``, or ``init_encoder``'s trunk.
 
     Raises:
-        FileNotFoundError: no file ``init``.
+        FileNotFoundError: no file ``init`` or ``init_encoder``.
         ValueError: a damaged file, or weights of another model.
     """
     torch.manual_seed(config.seed)
@@ -54,6 +55,11 @@ def build_model(config: Config) -> Forecaster:
             model.load_state_dict(given.state_dict())
         except RuntimeError as error:
             raise ValueError(f"`init` must hold weights of {config.model}, got {config.init} ({error})") from error
+    if config.init_encoder is not None:
+        try:
+            load_resnet34(model.encoder, config.init_encoder)
+        except ValueError as error:
+            raise ValueError(f"`init_encoder` must hold ResNet34's weights for {config.model} ({error})") from error
     model.autocast = _PRECISIONS[config.run.precision]
     return model.train()
 
@@ -122,10 +128,11 @@ class Trainer:
         step: Step = self._model(
             batch.frame_prev, batch.frame_cur, batch.K,
             [(batch.tgt_from_next, batch.target_K)] if self.stage.render else [],
-            prior=batch.prior if self._starts_from_prior() else None, horizon=batch.horizon,
+            prior=batch.prior if self._starts_from_prior() else None, own=batch.own, horizon=batch.horizon,
         )  # fmt: skip
         view = step.views[0] if step.views else None
-        loss, terms = total_loss(view, step, batch, self.config.loss_of(self.stage), self._perceptual)
+        terms_of = self.config.loss_of(self.stage), self._perceptual, self._budget()
+        loss, terms = total_loss(view, step, batch, *terms_of)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self._learning, self.config.optimiser.clip_norm or math.inf)
         broken = self.ranks.any(not (math.isfinite(loss.item()) and math.isfinite(norm.item())))
@@ -151,6 +158,11 @@ class Trainer:
 
     def _starts_from_prior(self) -> bool:
         return model_config(self.config).start == "prior"
+
+    def _budget(self) -> float | None:
+        """Blocks of object motion that routing should run on average."""
+        objects = model_config(self.config).object_motion
+        return None if objects is None or objects.routing is None else objects.routing.budget
 
     def _rate(self, done: int) -> float:
         return learning_rate_factor(done, self.stage, self.config.optimiser.final_factor)
