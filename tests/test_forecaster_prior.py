@@ -167,7 +167,8 @@ def test_the_world_stands_still_in_feedback() -> None:
 
     model.move = move  # type: ignore[assignment, method-assign]
     with torch.no_grad():
-        model.forecast(*pair_of(1, 32, 48), camera(1, 32, 48), 2, prior=measured(1, 32, 48, cur=(0, 0, -1)))
+        prior = measured(1, 32, 48, cur=(0, 0, -1))
+        model.forecast(*pair_of(1, 32, 48), camera(1, 32, 48), 2, mode="feedback", prior=prior)
     (_, later) = seen
     moving = later.velocity_cur.abs().amax(dim=1) > 0
     assert 0 < moving.float().mean() < 0.1  # the block of foreground

@@ -226,7 +226,7 @@ def test_batch_without_augmentation_is_what_the_clip_has(clips: list[PreparedCli
     assert batch.clips == (f"street 3/{clips[0].frame_name(2)}", f"street 5/{clips[1].frame_name(3)}")
     for b, (clip, t) in enumerate(((clips[0], 2), (clips[1], 3))):
         given = network_input(clip.frame(t - 1), clip.frame(t), last_motions(clip.frame(t - 1), clip.frame(t)))
-        for got, wanted in zip(leaves(tuple(batch[:4])), leaves(given), strict=True):
+        for got, wanted in zip(leaves((*batch[:4], batch.own)), leaves(given), strict=True):
             assert torch.equal(got[b : b + 1], wanted)
         here, there = clip.world_from_cam(t), clip.world_from_cam(t + 2)
         assert here is not None and there is not None
@@ -299,3 +299,19 @@ def test_crops_reach_every_edge() -> None:
         seen.add((round(top), round(left)))
     tops, lefts = zip(*seen, strict=True)
     assert set(tops) == set(range(5)) and set(lefts) == set(range(7))
+
+
+class RidingClip(FakeClip):
+    """Its second half has the recording car in the two lowest rows."""
+
+    def frame(self, index: int) -> Prepared:
+        return prepared(index, MOTIONS[index % 2] if index else None, own=index >= self.frames // 2)
+
+
+def test_batches_know_where_the_recording_car_is() -> None:
+    """Each window has it where its frames do, whatever the others have."""
+    windows = WindowSet([RidingClip(12)])
+    batch = windows.batch([Draw(0, t, 1, False, (0, t)) for t in (2, 6, 9)])
+    assert batch.own is not None and batch.own.shape == (3, 1, 8, 12)
+    assert batch.own[:, :, -2:].flatten(1).mean(dim=1).tolist() == [0, 1, 1]
+    assert not batch.own[:, :, :-2].any()

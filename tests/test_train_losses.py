@@ -1,5 +1,6 @@
 """Training's losses: zero for the truth, by hand, safe gradients, and a sum that takes what the configuration says."""
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -7,13 +8,14 @@ from typing import Any
 import pytest
 import torch
 from data_files import real
-from forecaster_scenes import SMALL, TINY, camera, pair_of, stir, turning
+from forecaster_scenes import OBJECTS, SMALL, TINY, camera, pair_of, stir, turning
 
 from train.config import LossConfig
 from train.data import Batch
 from train.losses import NEAREST, build_perceptual, path_errors, pose_errors, residual_motion, ssim_loss, total_loss
 from vestcl import geometry, metrics
-from vestcl.models import EgoMotion, RigidMotion
+from vestcl.models import EgoMotion, ObjectMotion, RigidMotion
+from vestcl.models.config import RoutingConfig
 from vestcl.models.forecaster import Forecaster, RenderedView, Step
 from vestcl.models.prior import MotionPrior
 from vestcl.models.trunks import Trunk
@@ -281,3 +283,28 @@ def test_shapes_are_checked() -> None:
         total_loss(view, step, batch._replace(target=batch.target[..., 1:]), settings(l1=1.0), None)
     with pytest.raises(ValueError, match="`known` must be"):
         pose_errors(step.future_from_cur, batch.future_from_cur, batch.pose_known[:1])
+
+
+def test_routing_is_held_to_its_budget() -> None:
+    """By the formula, in stages that render; models that run all blocks have no such term."""
+    torch.manual_seed(0)
+    routed = dataclasses.replace(TINY, object_motion=dataclasses.replace(OBJECTS, routing=RoutingConfig(4, budget=1.0)))
+    model, batch = (
+        Forecaster(routed),
+        batch_of(torch.rand(2, 3, HEIGHT, WIDTH), torch.eye(4).repeat(2, 1, 1), [True] * 2),
+    )
+    assert isinstance(model.object_motion, ObjectMotion) and model.object_motion.routing is not None
+    torch.nn.init.constant_(model.object_motion.routing.choose.bias, 1.0)
+    step = model(batch.frame_prev, batch.frame_cur, batch.K)
+    probabilities = step.motion.objects.probabilities
+    assert probabilities is not None
+    wanted = ((probabilities.sum(dim=1).mean() - 1.0) / 2) ** 2
+    loss, terms = total_loss(step.views[0], step, batch, settings(routing=0.5), None, 1.0)
+    assert number(terms["routing"]) == pytest.approx(number(wanted)) and number(loss) == pytest.approx(
+        number(wanted) / 2
+    )
+    loss.backward()
+    assert model.object_motion.routing.choose.bias.grad is not None
+    assert (model.object_motion.routing.choose.bias.grad > 0).all()
+    for view, budget in ((None, 1.0), (step.views[0], None)):
+        assert "routing" not in total_loss(view, step, batch, settings(), None, budget)[1]

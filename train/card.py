@@ -230,7 +230,7 @@ def _evaluate_command(told: dict[str, Any], weights: Weights) -> str:
     name, (height, width) = told["settings"]["protocol"], told["settings"]["size"]
     plain = PROTOCOLS[name]
     usual = {field.name: field.default for field in dataclasses.fields(Evaluation)}
-    usual |= {"steps": plain.steps, "first": plain.first, "last": plain.last}
+    usual |= {"steps": plain.steps, "first": plain.first, "last": plain.last, "mode": weights.config.default_mode}
     usual |= dict(zip(("height", "width"), plain.size, strict=True))
     settings = told["settings"] | {"height": height, "width": width, "data": told["settings"]["data"] and "DATA"}
     words = ["python -m train.evaluate", name, f"--model {weights.name}"]
