@@ -44,9 +44,10 @@ def test_the_shipped_network_is_the_usual_one(
     Forecaster(configuration("vest-s")).save(tmp_path / "vest-s.safetensors")
     demo.run(tmp_path / "with", height=48, width=160, seed=4, steps=1)
     said = " ".join(capsys.readouterr().out.split())
-    assert "forecast by the network vest-s" in said and "geometric, to compare" in said
+    assert "forecast by the network vest-s, mode compose" in said and "geometric, to compare" in said
     without, about = (json.loads((tmp_path / name / "forecast.json").read_text()) for name in ("without", "with"))
     assert (without["method"], about["method"]) == ("geometric", "vest-s")
+    assert "mode" not in without and about["mode"] == about["settings"]["mode"] == "compose"
     assert about["settings"]["model_file"] == "vest-s.safetensors"
     for view, scores in about["scores"].items():
         assert list(scores) == ["forecast", "geometric", "repeat last", "optical flow"]

@@ -76,6 +76,8 @@ def test_the_default_mode_is_the_models() -> None:
             forecast_frames(perception(), model(start), 2, 3, VIEWS),
             forecast_frames(perception(), model(start), 2, 3, VIEWS, mode=mode),  # type: ignore[arg-type]
         )
+        assert forecast_frames(perception(), model(start), 2, 1, VIEWS).mode == mode
+        assert forecast_frames(perception(), model(start), 2, 1, VIEWS, mode="compose").mode == "compose"
 
 
 def test_recursion_sees_what_it_is_given() -> None:

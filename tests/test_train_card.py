@@ -156,9 +156,7 @@ def test_commands_are_of_what_was_done(text: str) -> None:
     sizes = "--out streets --height 48 --width 160 --frames 6 --drive random"
     assert f"vestcl prepare street:7-8 street:10 {sizes}\n" in text
     assert "python -m train.fit vest-x/config.yaml out=runs/vest-x data.train='[\"streets\"]'\n" in text
-    settings = (
-        "--seeds 0 1 --steps 2 --samples 1 --height 48 --width 160 --mode compose"  # not what it would do by itself
-    )
+    settings = "--seeds 0 1 --steps 2 --samples 1 --height 48 --width 160 --mode compose"  # its own is feedback
     assert f"python -m train.evaluate street --model ema.safetensors {settings} --squeeze WEIGHTS\n" in text
 
 

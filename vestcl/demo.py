@@ -170,7 +170,9 @@ def _sheet(perception: Perception, index: int, forecast: Forecast, truth: dict[s
 
 
 def _how(forecast: Forecast) -> str:
-    return "without any trained weights" if forecast.method == GEOMETRIC else f"by the network {forecast.method}"
+    if forecast.method == GEOMETRIC:
+        return "without any trained weights"
+    return f"by the network {forecast.method}" + (f", mode {forecast.mode}" if forecast.mode else "")
 
 
 def _score_table(scores: dict[str, dict[str, list[dict[str, float]]]], forecast: Forecast) -> Table:

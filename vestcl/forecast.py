@@ -71,3 +71,5 @@ class Forecast:
     """By switch of `vestcl.models.skipping.Skip`."""
     notes: tuple[str, ...] = ()
     """Lines for the user: what was left out, and why."""
+    mode: str | None = None
+    """How a network made the steps after the first, "compose" or "feedback"; None of others."""

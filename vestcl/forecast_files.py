@@ -266,6 +266,8 @@ def _about(forecast: Forecast, clip: Clip, index: int, details: Details) -> dict
         "notes": [*forecast.notes, *([note] if (note := encoder_note()) else [])],
         **machine(),
     }
+    if forecast.mode:
+        about["mode"] = forecast.mode
     if forecast.profile:
         about["profile"] = forecast.profile
     if forecast.skipped:

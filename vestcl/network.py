@@ -112,7 +112,9 @@ def forecast_frames(
     skipped = what_was_skipped(tally, profile)
     seconds = perception.seconds | {"network": whole}
     notes = (*gap_notes(perception, index), *([] if note is None else [note]))
-    return Forecast(model.config.name, motions, frames, seconds, profile, skipped, notes)
+    return Forecast(
+        model.config.name, motions, frames, seconds, profile, skipped, notes, mode or model.config.default_mode
+    )
 
 
 def what_was_skipped(tally: Tally, profile: Mapping[str, float]) -> dict[str, Skipped]:
