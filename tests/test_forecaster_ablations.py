@@ -71,13 +71,16 @@ def test_without_emf_inpainted_points_move_as_object_motion_says_at_their_pixel(
 def test_each_inpainted_point_takes_the_motion_at_its_own_pixel() -> None:
     model, K = Forecaster(change(ego_motion=None)), camera(2, HEIGHT, WIDTH)
     prev, cur = (model.encode(layers) for layers in pair_of(2, HEIGHT, WIDTH))
-    motion = model.move(prev, cur, K)
-    motion = motion._replace(objects=motion.objects._replace(flow=torch.rand_like(motion.flow0)))
-    for cloud, flow, encoded in zip(
-        model.lift(prev, cur, motion, K), motion.objects.flow.split(3, dim=1), (prev, cur), strict=True
+    motion, flow, span = model.move(prev, cur, K), torch.rand(2, 6, HEIGHT, WIDTH), torch.tensor([1.5, 3.0])
+    motion = motion._replace(objects=motion.objects._replace(flow=flow), spans=(span[:, None, None, None], 1.0))
+    for cloud, own, spans, encoded in zip(
+        model.lift(prev, cur, motion, K), flow.split(3, dim=1), (span, torch.ones(2)), (prev, cur), strict=True
     ):
         hidden = encoded.layers.mask[:, 0] < 0.5
-        assert torch.equal(cloud.displacement_xyz[cloud.inpainted], flow.permute(0, 2, 3, 1)[hidden])
+        image = hidden.nonzero()[:, 0]
+        moved, step = (each[cloud.inpainted] for each in (cloud.displacement_xyz, cloud.step_xyz))
+        assert torch.equal(moved, own.permute(0, 2, 3, 1)[hidden])
+        assert torch.allclose(step, moved / spans[image][:, None])
 
 
 # ---------------------------------------------------------------- A: fixed depth
