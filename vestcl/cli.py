@@ -20,7 +20,7 @@ from vestcl.st_lpips import Option as StLpipsOption
 #: `vestcl bench train-step` is vestcl.bench.train_step; its ``main`` takes a TrainStepBench, may return an exit code.
 _BENCHES: Final = (
     *("splat", "operators", "pipeline", "train-step", "network"),
-    *("pareto", "stability", "inpaint", "forecast", "compare"),
+    *("pareto", "stability", "inpaint", "camera", "forecast", "compare"),
 )
 
 

@@ -1,0 +1,1 @@
+"""How the camera and the objects of a scene move."""
