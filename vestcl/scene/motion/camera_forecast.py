@@ -240,7 +240,7 @@ def forecast_camera(
     Raises:
         ValueError: no motion, not as many intervals, or as `CameraForecaster`.
     """
-    if not motions or len(motions) != len(intervals):
+    if len(motions) == 0 or len(motions) != len(intervals):
         raise ValueError(
             f"`motions` and `intervals` must have equal length of 1 or more, got {len(motions)}, {len(intervals)}"
         )
