@@ -37,7 +37,7 @@ from vestcl.scene.motion.gauss_markov import (
 Array = NDArray[np.float64]
 
 #: Standard deviation of a measured rotation, rad an axis: what PnP over a dense flow gives on a driving video.
-_TURN_NOISE: Final = np.radians(0.03)
+_TURN_NOISE: Final = np.radians(0.045)
 
 #: Yaw rate: it decays within the seconds that a bend takes, its rate of change follows the steering wheel (s), and
 #: reaches from a lane's corrections to a crossing's (rms, rad/s^2: a turn of 30 degrees/s entered within 1 s is 0.5).
