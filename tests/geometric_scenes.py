@@ -102,7 +102,7 @@ def cloud_of(
     y, x = np.nonzero(np.ones(depth.shape[1:], bool) if which is None else which)
     xyz = move(pose() if dst_from_src is None else dst_from_src, points(depth, K))[:, y, x].T.astype(np.float32)
     steps = np.tile(np.array(step_xyz, np.float32), (len(x), 1))
-    return Cloud(xyz, depth[0, y, x], np.ascontiguousarray(image[:, y, x].T), steps, y, x)
+    return Cloud(xyz, depth[0, y, x], image, steps, y, x)
 
 
 def decibels(got: NDArray[Any], wanted: NDArray[Any], where: NDArray[np.bool_] | None = None) -> float:

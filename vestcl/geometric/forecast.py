@@ -177,7 +177,7 @@ def _cloud(
     if cur_from_src is not None:
         points = _transform(cur_from_src, points + elapsed * speed)
         speed = speed @ cur_from_src[:3, :3].T
-    z_src, colour = z.astype(np.float32), image[:, y, x].T
+    z_src = z.astype(np.float32)
     rides = np.zeros((len(x), 1), bool) if own is None else own[0, y, x][:, None]
 
     def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
@@ -185,7 +185,7 @@ def _cloud(
             np.where(rides, points, _transform(future_from_cur[k], points + k * speed)) for k in (step, step - 1)
         )
         step_xyz = (there - before).astype(np.float32)
-        return Cloud(there.astype(np.float32), z_src, colour, step_xyz, y, x)
+        return Cloud(there.astype(np.float32), z_src, image, step_xyz, y, x)
 
     return at
 

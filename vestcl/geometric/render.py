@@ -1,8 +1,15 @@
-"""Point clouds on a new view, colour shown directly: image / coverage, and clouds one behind the other."""
+"""Point clouds on a new view: where each pixel's surface was seen, and the colour there; clouds one behind the other.
+
+A composite of opaque points mixes their colours by their order in depth, and is off by a fraction of a pixel wherever
+two of them share one. So points carry where they were seen, s, and how that changes over the view, A = ds/dt around
+their position t: each says of the pixel p that its surface was seen at s + A (p - t), and the mean over the composite
+is exact to first order whatever the weights are. The colour is taken from there.
+"""
 
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +33,19 @@ _NEIGHBOURS, _LINE = 3, 1.1
 #: Less coverage than that is a hole.
 _HOLE: Final = 0.05
 
+#: A pixel shows one surface if its points were seen within so many pixels of each other (standard deviation), and the
+#: place where its own surface was seen is no farther than that from their mean. Elsewhere colours are mixed.
+_ONE_SURFACE, _EXTRAPOLATED = 1.5, 2.0
+
+#: What makes a point at an edge count as of several surfaces, px^2: a tenth of the composite is enough.
+_EDGE: Final = 10 * _ONE_SURFACE**2
+
+#: The area that a pixel of the source grows to, as a factor of what its depth says, lies in this range on a surface.
+_GROWTH: Final = (0.2, 5.0)
+
+#: Squared positions are carried in thousands of pixels, so that float32 keeps their differences.
+_SQUARED: Final = 1000.0
+
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
@@ -35,8 +55,8 @@ class Cloud:
     """[N, 3] m, in the source camera's frame at that time."""
     z_src: NDArray[np.float32]
     """[N] m, depth in the picture that the points come from."""
-    colour: NDArray[np.float32]
-    """[N, 3] RGB."""
+    image: NDArray[np.float32]
+    """[3, H, W] RGB, the image that the points come from."""
     step_xyz: NDArray[np.float32]
     """[N, 3] m: how far each came over the last frame interval."""
     rows: NDArray[np.intp]
@@ -95,9 +115,54 @@ def _splat(
     radii = np.clip(RHO * stretch, *RADIUS_LIMITS)[None]
     opacities = (whole & (RHO * zoom <= RADIUS_LIMITS[1]))[None].astype(np.float32)
     inverse = 1 / np.maximum(z[0], np.float32(1e-3))
-    features = np.concatenate([cloud.colour, inverse[:, None], cloud.step_xyz], axis=1)[None]
-    image, coverage = vestcl.splat(points_uv, z, radii, opacities, features, height, width)
-    return np.ascontiguousarray(image[0]), coverage[0]
+    colour = cloud.image[:, cloud.rows, cloud.columns].T
+    features = np.concatenate(
+        [colour, inverse[:, None], cloud.step_xyz, _origins(cloud, points_uv[0], zoom, whole)], axis=1
+    )
+    image, coverage = vestcl.splat(points_uv, z, radii, opacities, features[None], height, width)
+    mean = image[0] / np.maximum(coverage[0], np.float32(1e-6))
+    mean[:3] = _colour(mean, cloud.image)
+    return mean[:7] * coverage[0], coverage[0]
+
+
+def _origins(
+    cloud: Cloud, points_uv: NDArray[np.float32], zoom: NDArray[np.float32], solid: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """[N, 9]: s - A t, the four numbers of A, s and |s|^2: what `_colour` needs of each point.
+
+    A is the inverse of dt/ds, by central differences over the image that the points come from. Where they tear, or a
+    neighbour is not ``solid`` [N], the colours around a point are not all its surface's: |s|^2 is larger by _EDGE.
+    """
+    rows, columns = cloud.rows + 1, cloud.columns + 1
+    places = np.full((2, cloud.image.shape[1] + 2, cloud.image.shape[2] + 2), np.nan, np.float32)
+    places[:, rows, columns] = np.where(solid, points_uv.T, np.float32(np.nan))
+    (a, c), (b, d) = (
+        (places[:, rows + down, columns + right] - places[:, rows - down, columns - right]) / 2
+        for down, right in ((0, 1), (1, 0))
+    )
+    growth, alike = a * d - b * c, 1 / np.maximum(zoom, np.float32(1e-3))
+    longest = np.square(np.maximum(zoom, np.float32(1))) * constants.TORN**2
+    whole = (a * a + c * c < longest) & (b * b + d * d < longest)
+    whole &= (growth > _GROWTH[0] * zoom**2) & (growth < _GROWTH[1] * zoom**2)
+    safe = np.where(whole, growth, np.float32(1))
+    slope = [np.where(whole, part / safe, flat) for part, flat in ((d, alike), (-b, 0), (-c, 0), (a, alike))]
+    seen = np.stack([cloud.columns, cloud.rows]).astype(np.float32) + np.float32(0.5)
+    u, v = points_uv.T
+    start = [seen[0] - slope[0] * u - slope[1] * v, seen[1] - slope[2] * u - slope[3] * v]
+    squared = (seen**2).sum(0) + np.where(whole, 0, np.float32(_EDGE))
+    return np.stack([*start, *slope, *seen, squared / np.float32(_SQUARED)], axis=1).astype(np.float32)
+
+
+def _colour(mean: NDArray[np.float32], image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[3, H, W]: of ``image`` where the surface was seen; where a pixel shows several, the mean of their colours."""
+    height, width = mean.shape[1:]
+    y, x = np.mgrid[:height, :width].astype(np.float32) + np.float32(0.5)
+    start, slope, seen, squared = mean[7:9], mean[9:13], mean[13:15], mean[15] * np.float32(_SQUARED)
+    u, v = start[0] + slope[0] * x + slope[1] * y, start[1] + slope[2] * x + slope[3] * y
+    one = np.hypot(u - seen[0], v - seen[1]) < _EXTRAPOLATED
+    one &= squared - (seen**2).sum(0) < _ONE_SURFACE**2
+    there = [cv2.remap(plane, u - 0.5, v - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in image]
+    return np.where(one, np.stack(there), mean[:3])
 
 
 def _surface(

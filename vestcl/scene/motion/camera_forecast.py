@@ -36,8 +36,9 @@ from vestcl.scene.motion.gauss_markov import (
 
 Array = NDArray[np.float64]
 
-#: Standard deviation of a measured rotation, rad an axis: what PnP over a dense flow gives on a driving video.
-_TURN_NOISE: Final = np.radians(0.045)
+#: Standard deviation of a measured rotation, rad an axis: what PnP over a dense flow gives on a driving video with
+#: depth, and of the yaw without depth, as a turn and a step aside look much alike.
+_TURN_NOISE: Final = (np.radians(0.045), np.radians(0.12))
 
 #: Yaw rate: it decays within the seconds that a bend takes, its rate of change follows the steering wheel (s), and
 #: reaches from a lane's corrections to a crossing's (rms, rad/s^2: a turn of 30 degrees/s entered within 1 s is 0.5).
@@ -49,11 +50,11 @@ _TURNING: Final = (0.02, 0.06, 0.2, 0.6)
 #: degrees) from motorways to cobbles.
 _BODY_HERTZ: Final = (1.0, 1.7)
 _BODY_DAMPING: Final = (0.3, 0.6)
-_BODY_DEGREES: Final = (0.05, 0.15, 0.4)
+_BODY_DEGREES: Final = (0.02, 0.05, 0.15, 0.4)
 
 #: The road's grade and banking: rms rate, degrees/s (a vertical curve of 250 m radius at 10 m/s has 2.3), and
 #: correlation time, s.
-_ROAD_RATES: Final = (0.2, 0.8, 2.5)
+_ROAD_RATES: Final = (0.05, 0.2, 0.8, 2.5)
 _ROAD_SECONDS: Final = (0.5, 2.0)
 
 #: Acceleration: rms, m/s^2, from cruising to firm braking, and correlation time, s. Noise of a measured length, m.
@@ -76,11 +77,13 @@ _ACROSS_NOISE: Final = 0.004
 FEWEST: Final = 2
 
 _YAW: Final = tuple(
-    joined(driven_rate(decay, seconds, rms), noise=_TURN_NOISE)
-    for decay, seconds, rms in itertools.product(_BENDS, _STEERING, _TURNING)
+    joined(driven_rate(decay, seconds, rms), noise=noise)
+    for decay, seconds, rms, noise in itertools.product(_BENDS, _STEERING, _TURNING, _TURN_NOISE)
 )
 _NOD: Final = tuple(
-    joined(oscillator(hertz, damping, np.radians(degrees)), decaying_rate(seconds, np.radians(rate)), noise=_TURN_NOISE)
+    joined(
+        oscillator(hertz, damping, np.radians(degrees)), decaying_rate(seconds, np.radians(rate)), noise=_TURN_NOISE[0]
+    )
     for hertz, damping, degrees, rate, seconds in itertools.product(
         _BODY_HERTZ, _BODY_DAMPING, _BODY_DEGREES, _ROAD_RATES, _ROAD_SECONDS
     )
