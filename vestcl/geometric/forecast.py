@@ -1,4 +1,4 @@
-"""Future frames from new views at constant velocity: the camera's, and each object's.
+"""Future frames from new views: the camera by its forecast motion, each point by the velocity that proved best.
 
 Velocities are per interval of the clip (`Clip.interval`), whatever the time between the frames they are measured in.
 """
@@ -14,11 +14,15 @@ from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
 from vestcl.geometric.perception import Perception
 from vestcl.geometric.render import Cloud, Shown, holes, rendered, show
-from vestcl.scene.ego_motion import constant_velocity
 from vestcl.scene.holes import deep_holes, fill_holes
+from vestcl.scene.motion.camera_forecast import forecast_camera
 
-#: Of so many last motions the mean is extrapolated: two are smoother than one, and still follow a bend.
-_MOTIONS: Final = 2
+#: The camera is forecast from so many last motions. On KITTI odometry 00 four have 0.66 of constant velocity's error of
+#: rotation at t+1 and 0.77 of that of translation, all that were before 0.65 and 0.72; each takes a flow and a depth.
+_MOTIONS: Final = 4
+
+#: Seconds between frames of a clip without times: KITTI's.
+_INTERVAL: Final = 0.1
 
 #: The name of this method in tables and files.
 METHOD: Final = "geometric"
@@ -132,10 +136,11 @@ def show_frame(perception: Perception, index: int, views: Sequence[View]) -> dic
 
 def _extrapolate(perception: Perception, index: int, steps: int) -> list[NDArray[np.float64]]:
     """future_from_cur for each step, which is an interval of the clip."""
-    seen = range(max(index - _MOTIONS + 1, 1), index + 1)
-    motions = [np.asarray(np.linalg.inv(perception.prev_from_cur(i)), np.float64) for i in seen]
-    motion = constant_velocity(motions, [perception.clip.elapsed(i) for i in seen])
-    return [np.linalg.matrix_power(motion, step) for step in range(1, steps + 1)]
+    clip, seen = perception.clip, range(max(index - _MOTIONS + 1, 1), index + 1)
+    motions = [np.linalg.inv(perception.prev_from_cur(i)) for i in seen]
+    interval = clip.interval or _INTERVAL
+    ahead = [step * interval for step in range(1, steps + 1)]
+    return forecast_camera(motions, [clip.elapsed(i) * interval for i in seen], ahead)
 
 
 MovingCloud = Callable[[int, list[NDArray[np.float64]]], Cloud]
@@ -148,7 +153,7 @@ def _clouds(perception: Perception, index: int) -> list[MovingCloud]:
     cur, prev = perception.seen(index), perception.seen(index - 1)
     cur_from_prev = np.asarray(np.linalg.inv(perception.prev_from_cur(index)), np.float64)
     everything = np.ones_like(cur.layers.mask)
-    shown = _cloud(cur.layers.image, cur.layers.depth, everything, K, cur.velocity, cur.own)
+    shown = _cloud(cur.layers.image, cur.layers.depth, everything, K, perception.velocity(index), cur.own)
     since = cur_from_prev, perception.clip.elapsed(index)
     before = _cloud(prev.layers.image, prev.layers.depth, ~prev.own, K, prev.velocity, None, *since)
     hidden = ~cur.layers.mask & ~cur.own

@@ -20,6 +20,7 @@ from vestcl.scene.correspondence import Correspondence, correspond
 from vestcl.scene.ego_motion import ego_motion
 from vestcl.scene.layers import Layers, build_layers
 from vestcl.scene.lidar import densify
+from vestcl.scene.motion import backtest
 from vestcl.scene.motion_depth import MotionDepth, motion_depth
 from vestcl.scene.motion_mask import motion_mask
 from vestcl.scene.parallax import View, refine_depth
@@ -113,6 +114,14 @@ class Perception:
     def seen(self, index: int) -> Seen:
         """The frame's layers and things."""
         return self._once("layers", index, lambda: self._see(index))
+
+    def velocity(self, index: int) -> NDArray[np.float32]:
+        """[3, H, W] m an interval, of each pixel's point at frame ``index`` in the world: what its object does, or what
+        flow shows, or rest, as each of them would have forecast this frame from the one before.
+
+        Without two frames before, it is that of `seen`.
+        """
+        return self._once("backtest", index, lambda: self._backtested(index))
 
     def inverse_std(self, index: int) -> float:
         """Standard deviation of 1 / depth, 1/m."""
@@ -242,3 +251,23 @@ class Perception:
             velocity = confirmed(by_flow, velocity, layers.depth, pair)
             velocity /= np.float32(self.clip.elapsed(index))
         return Seen(layers, things, velocity, own)
+
+    def _backtested(self, index: int) -> NDArray[np.float32]:
+        now = self._candidates(index)
+        if index < 2 or self.is_lost(index) or self.is_lost(index - 1):
+            return now[0]
+        before = self._candidates(index - 1) * np.float32(self.clip.elapsed(index))
+        return backtest.mixed(now, backtest.backtest(before, self._frame(index - 1), self._frame(index)))
+
+    def _candidates(self, index: int) -> NDArray[np.float32]:
+        """[3, 3, H, W] m an interval: the object's velocity, what flow shows beyond the camera's motion, and rest."""
+        velocity = self.seen(index).velocity
+        if index == 0:
+            return np.stack([velocity] * 3)
+        by_flow = backtest.residual_velocity(self._frame(index)) / np.float32(self.clip.elapsed(index))
+        return np.stack([velocity, by_flow, np.zeros_like(velocity)])
+
+    def _frame(self, index: int) -> backtest.Frame:
+        flow_uv = self.correspondence(index).flow_uv
+        layers, K = self.seen(index).layers, self.clip[index].K
+        return backtest.Frame(self.image(index), layers.depth, flow_uv, self.prev_from_cur(index), K)
