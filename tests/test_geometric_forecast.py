@@ -16,6 +16,7 @@ from vestcl.geometric.forecast import METHOD, _clouds, forecast_clip, forecast_f
 from vestcl.geometric.perception import Perception
 from vestcl.geometric.render import holes, show
 from vestcl.scene.correspondence import correspond
+from vestcl.scene.motion.camera_forecast import forecast_camera
 
 LEFT, RIGHT = View("left", np.eye(4)), View("right", pose(xyz=(-0.54, 0, 0)))
 
@@ -72,9 +73,11 @@ def test_true_cameras_are_taken() -> None:
     assert all(np.array_equal(a, b) for a, b in zip(given, cameras, strict=True))
 
 
-def test_cameras_go_on_at_constant_velocity() -> None:
-    cameras = forecast(*PLAIN).future_from_cur
-    np.testing.assert_allclose(cameras[2], cameras[0] @ cameras[0] @ cameras[0], atol=1e-9)
+def test_cameras_are_forecast_from_the_motions_before() -> None:
+    cameras, seen = forecast(*PLAIN).future_from_cur, perception(*PLAIN)
+    motions = [np.linalg.inv(seen.prev_from_cur(index)) for index in range(max(NOW - 3, 1), NOW + 1)]
+    wanted = forecast_camera(motions, [0.1] * len(motions), [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(cameras[:3], wanted, atol=1e-6)
     np.testing.assert_allclose(cameras[0][:3, 3], true_cameras(perception(*PLAIN).clip)[0][:3, 3], atol=0.1)
 
 

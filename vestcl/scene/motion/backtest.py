@@ -1,8 +1,8 @@
 """Candidate motions of each pixel's point, weighted by how well they would have forecast the frame already seen.
 
 A candidate c gives every pixel of t - 1 a velocity v_c. With the camera's measured motion it forecasts where the
-pixel's point is at t: e_c = |I_(t-1)(p) - I_t(project(K (R (x + v_c) + t)))|^2, smoothed. The velocity that it has for t
-is trusted as far as the one before was right: w_c = e_c^-g / sum e^-g.
+pixel's point is at t: e_c = |I_(t-1)(p) - I_t(project(K (R (x + v_c) + t)))|^2, smoothed. The velocity that it has for
+t is trusted as far as the one before was right: w_c = e_c^-g / sum e^-g.
 """
 
 from typing import Final, NamedTuple
