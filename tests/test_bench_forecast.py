@@ -255,7 +255,7 @@ def test_a_run_prints_and_writes_everything(tmp_path: Path, capsys: pytest.Captu
 
 def test_the_command_line_reaches_it(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["bench", "forecast", "street:4", "--steps", "0"]) == 2
-    assert "`steps` must be 1 or more" in capsys.readouterr().err
+    assert "--steps must be 1 or more" in capsys.readouterr().err
 
 
 def test_pooled_inputs_share_a_table() -> None:

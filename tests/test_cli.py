@@ -42,7 +42,7 @@ def test_an_unknown_device_is_one_red_line(capsys: pytest.CaptureFixture[str], m
     out, err = capsys.readouterr()
     assert out == ""
     assert err.count("\n") == 1
-    assert err.startswith("\x1b[31merror: VESTCL_DEVICE or selector 'abacus' fits none of the OpenCL devices")
+    assert err.startswith("\x1b[31merror: VESTCL_DEVICE 'abacus' fits none of the OpenCL devices")
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,11 +81,11 @@ def test_what_a_user_can_put_right_is_one_line(
     kind: type[Exception], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def run(*_: object) -> None:
-        raise kind("`height` must be positive, got 0")
+        raise kind("`height` must be even, got 1")
 
     put_module(monkeypatch, "vestcl.demo", run=run)
-    assert cli.main(["demo", "--height", "0"]) == 2
-    assert capsys.readouterr().err == "error: `height` must be positive, got 0\n"
+    assert cli.main(["demo", "--height", "1"]) == 2
+    assert capsys.readouterr().err == "error: --height must be even, got 1\n"
 
 
 def test_bench(monkeypatch: pytest.MonkeyPatch) -> None:

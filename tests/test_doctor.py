@@ -54,10 +54,13 @@ def test_vendors_folder_that_does_not_exist(tmp_path: Path, monkeypatch: pytest.
     assert f"OCL_ICD_VENDORS names {tmp_path / 'gone'}, which does not exist" in notes(report)
 
 
-def test_a_pocl_that_can_not_start(only_pip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_that_pocl_can_not_write(only_pip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "file" / "folder"))
-    assert "no OpenCL device, though PoCL is installed: let POCL_CACHE_DIR" in notes(doctor.examine())
+    report = doctor.examine()
+    assert report.works, "kernels go to a temporary one"
+    assert f"PoCL's cache {tmp_path / 'file' / 'folder'} can't be used (Not a directory)" in notes(report)
+    assert "let POCL_CACHE_DIR name a folder that can be written" in notes(report)
 
 
 def test_no_pocl(only_pip: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -218,26 +218,26 @@ def test_weights_of_distances(
 @pytest.mark.parametrize(
     ("told", "message"),
     [
-        ("--steps 0", "`steps` must be 1 or more, got 0"),
-        ("--height 0", "`height` must be 1 or more, got 0"),
-        ("--frame 0", "`frame` must be 1 ... 5, to have a frame before it, got 0"),
-        ("--frame 6", "`frame` must be 1 ... 5, to have a frame before it, got 6"),
+        ("--steps 0", "--steps must be 1 or more, got 0"),
+        ("--height 0", "--height must be 1 or more, got 0"),
+        ("--frame 0", "--frame must be 1 ... 5, to have a frame before it, got 0"),
+        ("--frame 6", "--frame must be 1 ... 5, to have a frame before it, got 6"),
         ("--frame 5 --compare", "must be 1 ... 4, to have a frame before it and one after it to compare with, got 5"),
         ("--compare", "must have 7 frames to compare 5 steps, got 6"),
-        ("--compare --steps 1 --view 0,0,1", "`views` must have one with a truth to compare with"),
-        ("--view above", "`view` must be"),
+        ("--compare --steps 1 --view 0,0,1", "--view must have one with a truth to compare with"),
+        ("--view above", "--view must be"),
         ("--view right --view right", "got right twice"),
-        ("--perceive splatted", "`perceive` is how a network sees its own forecast; it needs `model`"),
-        ("--mode feedback", "`mode` is how a network goes on after its first step; it needs `model`"),
+        ("--perceive splatted", "--perceive is how a network sees its own forecast; it needs --model"),
+        ("--mode feedback", "--mode is how a network goes on after its first step; it needs --model"),
         ("--model vest-xl", "vest-xl: is no model: no file, no checkpoint's folder, and none of vest-s"),
-        ("--squeeze x.pth", "`squeeze` is a distance to the truth; it needs `compare`"),
+        ("--squeeze x.pth", "--squeeze is a distance to the truth; it needs --compare"),
         ("--squeeze x.pth --compare --steps 1", "no squeezenet1_0 weights at x.pth"),
-        ("--st-lpips", "`st_lpips` is a distance to the truth; it needs `compare`"),
+        ("--st-lpips", "--st-lpips is a distance to the truth; it needs --compare"),
         ("--st-lpips x.pth --compare --steps 1", "no ST-LPIPS weights at x.pth"),
-        ("--fov 90", "camera.json: tells the camera; leave out `fov`"),
-        ("--rig grey", "is folder, which takes fov, not rig"),
-        ("--depth nowhere", "nowhere: has no 0000 ending in .png, .exr, .npy"),
-        ("--device abacus", "VESTCL_DEVICE or selector 'abacus' fits none"),
+        ("--fov 90", "camera.json: tells the camera; leave out --fov"),
+        ("--rig grey", "is folder, which takes --fov, not --rig"),
+        ("--depth nowhere", "--depth must be a folder of files with the frames' names, and nowhere does not exist"),
+        ("--device abacus", "--device 'abacus' fits none"),
     ],
 )
 def test_mistakes_are_one_line(
@@ -257,9 +257,9 @@ def test_mistakes_with_the_input_are_one_line(
 ) -> None:
     for told, message in (
         ("nowhere", "nowhere: no such file or folder"),
-        ("street:x", "street:x: no such file or folder"),
-        ("street:0 --fov 9 --depth d", "street:0: is a street, which takes height and width, not fov, depth"),
-        ("street:0 --frame 0", "`frame` must be 1"),
+        ("street:x", "street:x: must be street:SEED"),
+        ("street:0 --fov 9 --depth d", "street:0: is a street, which takes --height, --width, not --fov, --depth"),
+        ("street:0 --frame 0", "--frame must be 1"),
     ):
         assert cli.main(["forecast", *told.split(), "--out", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err
@@ -270,6 +270,6 @@ def test_an_out_that_is_a_file_is_one_line(
 ) -> None:
     taken = write_text(tmp_path / "taken", "mine")
     assert cli.main(["forecast", str(folder), "--out", str(taken)]) == 2
-    assert capsys.readouterr().err == f"error: `out` must be a folder, got the file {taken}\n"
+    assert capsys.readouterr().err == f"error: --out must be a folder, got the file {taken}\n"
     assert not repeater.calls
     assert taken.read_text() == "mine\n"

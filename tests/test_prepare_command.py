@@ -115,13 +115,13 @@ def test_errors(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert error(str(tmp_path / "nowhere"), *out).endswith("nowhere: no such file or folder")
     assert "is no clip that vestcl knows" in error(str(tmp_path), *out)
     assert error("street:7-5", *out).endswith("must have streets from a lower to a higher seed, got street:7-5")
-    assert error("street:5", *out, "--rig", "grey").endswith("it does not take rig")
-    assert error("street:5", *out, "--mask-model", "x").endswith("it does not take mask_model")
-    assert error("street:5", *out, "--frames", "1") == "error: `frames` must be 2 or more, got 1"
-    assert error("street:5", *out, "--workers", "0") == "error: `workers` must be 1 or more, got 0"
-    assert error("street:5", *out, "--shard", "2/2").startswith("error: `shard` must be I/N")
-    assert error("street:5", "--out", str(file)) == f"error: `out` must be a folder, got the file {file}"
-    assert error(*out) == "error: `inputs` must be one or more clips, got none"
+    assert error("street:5", *out, "--rig", "grey").endswith("it does not take --rig")
+    assert error("street:5", *out, "--mask-model", "x").endswith("it does not take --mask-model")
+    assert error("street:5", *out, "--frames", "1") == "error: --frames must be 2 or more, got 1"
+    assert error("street:5", *out, "--workers", "0") == "error: --workers must be 1 or more, got 0"
+    assert error("street:5", *out, "--shard", "2/2").startswith("error: --shard must be I/N")
+    assert error("street:5", "--out", str(file)) == f"error: --out must be a folder, got the file {file}"
+    assert error(*out) == "error: INPUTS must be one or more clips, got none"
     assert "is where both street:5 and street:5 would go" in error("street:5", "street:5", *out)
     write_text(folder / ".vestcl", "")
     assert error(str(folder), *SMALL).endswith("can't be written (Not a directory); `--out` names another folder")

@@ -37,4 +37,4 @@ def test_the_network_gets_what_was_asked_for(level: Quality | None, tmp_path: Pa
 def test_geometry_has_no_quality(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clip = write_clip(tmp_path / "clip")
     assert cli.main(["forecast", str(clip), "--out", str(tmp_path / "out"), "--quality", "fast"]) == 2
-    assert "`quality` is how exactly a network computes; it needs `model`" in capsys.readouterr().err
+    assert "--quality is how exactly a network computes; it needs --model" in capsys.readouterr().err

@@ -92,6 +92,16 @@ def test_told_to_stop_it_saves_and_leaves(cache: Path, processes: Processes, who
     assert_same_run(out, whole)
 
 
+def test_ctrl_c_saves_and_leaves(cache: Path, processes: Processes, whole: Path, tmp_path: Path) -> None:
+    file, out = str(write_yaml(tmp_path / "run.yaml", cache, tmp_path / "out")), tmp_path / "out"
+    assert processes.train(file, moment="SIGINT update 5") == 130
+    last = out / "checkpoints" / "step-00000005"
+    assert f"stopped after step 5; the last checkpoint is {last}; --resume resumes\n" in processes.output
+    assert processes.output.count("stopped") == 1 and "Traceback" not in processes.output
+    assert processes.train(file, "--resume") == 0
+    assert_same_run(out, whole)
+
+
 def assert_same_run(out: Path, wanted: Path) -> None:
     """Weights, running mean, optimiser and schedule are the same bits, and so is every scalar but the seconds."""
     got, straight = checkpoint.load_latest(out), checkpoint.load_latest(wanted)

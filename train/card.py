@@ -27,6 +27,7 @@ from train.config import Config, from_dict
 from train.evaluate import Evaluation
 from train.protocols import PROTOCOLS
 from train.report import LOG, read_log
+from vestcl import command_line, interrupt
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models._checkpoint import read_checkpoint
 from vestcl.pretrained import find_model
@@ -66,9 +67,10 @@ class Card:
     """A command that prepared data; more than one may be told. Without it they are guessed from the clips."""
 
 
+@interrupt.command
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; what a user can put right is told in one line, with exit code 2."""
-    options = tyro.cli(Card, prog="python -m train.card", description=__doc__, args=arguments)
+    options = command_line.parsed(Card, "python -m train.card", __doc__, arguments)
     with warnings_in_lines():
         try:
             for path in write_card(options):

@@ -32,7 +32,7 @@ from train.evaluate_sheets import write_sheets
 from train.evaluate_windows import PART_WINDOWS, Part, Setup, plan, prepared, read_part, run_part
 from train.protocols import HELD_OUT, NOW_NOTE, PROTOCOLS, Name, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
-from vestcl import __version__, peer, runtime, st_lpips
+from vestcl import __version__, command_line, interrupt, peer, runtime, st_lpips
 from vestcl.bench import _results
 from vestcl.io.atomic import write_bytes
 from vestcl.metrics import MS_SSIM_SIDE
@@ -124,9 +124,10 @@ class Evaluation:
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
 
 
+@interrupt.command
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; what a user can put right is told in one line, with exit code 2."""
-    config = tyro.cli(Evaluation, prog="python -m train.evaluate", description=__doc__, args=arguments)
+    config = command_line.parsed(Evaluation, "python -m train.evaluate", __doc__, arguments)
     try:
         evaluate(config)
     except ERRORS as error:

@@ -4,12 +4,15 @@ Weights are rounded to float16, which halves the file; they are read as float32 
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import tyro
 
 from train.command import ERRORS, failed
+from vestcl import command_line, interrupt
 from vestcl.models._checkpoint import read_trained_on, write_checkpoint
 from vestcl.pretrained import find_model, load_model
 
@@ -23,10 +26,13 @@ class Export:
     out: tyro.conf.Positional[Path]
     """The file to write, *.safetensors."""
 
+    OUTPUT_FILES: ClassVar = ("out",)
 
-def main(arguments: list[str] | None = None) -> int:
+
+@interrupt.command
+def main(arguments: Sequence[str] | None = None) -> int:
     """The command; its exit status."""
-    options = tyro.cli(Export, args=arguments, description=__doc__, prog="python -m train.export")
+    options = command_line.parsed(Export, "python -m train.export", __doc__, arguments)
     try:
         export(options.checkpoint, options.out)
     except ERRORS as error:

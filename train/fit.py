@@ -9,7 +9,7 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ from train.losses import build_perceptual
 from train.ranks import Ranks, lost_processes_named
 from train.report import Reporter
 from train.trainer import Average, NotANumberError, Trainer, build_model
-from vestcl import runtime
+from vestcl import command_line, interrupt, runtime
 from vestcl.data.splits import KITTI_TRAINING
 from vestcl.models._checkpoint import Frames, read_trained_on
 from vestcl.models._weights import misfit
@@ -58,9 +58,10 @@ class Options:
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
 
 
-def main(arguments: list[str] | None = None) -> int:
+@interrupt.command
+def main(arguments: Sequence[str] | None = None) -> int:
     """The command; its exit status."""
-    options = tyro.cli(Options, args=arguments, description=__doc__, prog="python -m train.fit")
+    options = command_line.parsed(Options, "python -m train.fit", __doc__, arguments)
     with warnings_in_lines():
         try:
             return 0 if _fit(options) else STOPPED
@@ -83,7 +84,7 @@ def _fit(options: Options) -> bool:
 
 
 def fit(config: Config, *, go_on: bool = False, ranks: Ranks | None = None, device: str | None = None) -> bool:
-    """Train to the end of the last stage, or until SIGTERM.
+    """Train to the end of the last stage, or until SIGTERM or SIGINT.
 
     Args:
         config: of the run.
@@ -99,13 +100,19 @@ def fit(config: Config, *, go_on: bool = False, ranks: Ranks | None = None, devi
         TrainingError: a loss or gradient that is no number.
         CheckpointError: the last checkpoint can't be written, or none can be read.
         ChildProcessError: a process that reads data was killed.
+        KeyboardInterrupt: after SIGINT, with a checkpoint of where it was.
     """
     ranks = ranks or Ranks()
     state = _last_state(config, go_on)
     if config.run.threads:
         torch.set_num_threads(config.run.threads)
     with runtime.use(device or ranks.device()), _stop_signal() as stop:
-        return _Run(config, ranks, stop).go(state)
+        run = _Run(config, ranks, stop)
+        with interrupt.summary(run.where):
+            finished = run.go(state)
+            if stop.asked == signal.SIGINT and not finished:
+                raise KeyboardInterrupt
+        return finished
 
 
 def _last_state(config: Config, go_on: bool) -> State | None:
@@ -120,22 +127,34 @@ def _last_state(config: Config, go_on: bool) -> State | None:
 
 
 class _Stop:
-    """Set by SIGTERM: the update that is being made is still made."""
+    """Set by SIGTERM and SIGINT: the update that is being made is still made. A second SIGINT is not waited for."""
 
-    asked = False
+    asked = 0
+    """The signal."""
+
+    def __init__(self) -> None:
+        numbers = (number for number in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(number) != signal.SIG_IGN)
+        self._before = {number: signal.signal(number, self) for number in numbers}
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        self.asked = True
+        before = self._before.get(signal.Signals(number))
+        if self.asked == number == signal.SIGINT and callable(before):
+            before(number, frame)
+        self.asked = number
+
+    def restore(self) -> None:
+        """The handlers that there were."""
+        for number, before in self._before.items():
+            signal.signal(number, before)
 
 
 @contextmanager
 def _stop_signal() -> Iterator[_Stop]:
     stop = _Stop()
-    before = signal.signal(signal.SIGTERM, stop)
     try:
         yield stop
     finally:
-        signal.signal(signal.SIGTERM, before)
+        stop.restore()
 
 
 class _Run:
@@ -166,10 +185,19 @@ class _Run:
                     trainer.restore(state.optimiser, state.scheduler)
                 state = None
                 if not self._train(trainer, position.number, position.step):
-                    self.report.say(f"stopped after step {self.step}; --resume goes on")
+                    if self.stop.asked != signal.SIGINT:  # whose line `interrupt.command` prints
+                        self.report.say(f"stopped after step {self.step}; --resume goes on")
                     return False
         self.report.say(f"finished: {self.config.out}")
         return True
+
+    def where(self) -> str:
+        """The line of a run that Ctrl-C stopped; the first process prints it for all."""
+        if not self.ranks.first:
+            return ""
+        last = next(iter(checkpoint.list_checkpoints(self.config.out)), None)
+        there = "there is no checkpoint" if last is None else f"the last checkpoint is {last}; --resume resumes"
+        return f"stopped after step {self.step}; {there}"
 
     def _train(self, trainer: Trainer, number: int, done: int) -> bool:
         """The rest of a stage, of which ``done`` updates are made; whether it was finished."""
@@ -183,8 +211,10 @@ class _Run:
             windows, self.config.seed + number, stage.batch, steps, rank=self.ranks.rank, world=self.ranks.world,
             workers=self.config.data_of(stage).workers,
         )  # fmt: skip
+        with interrupt.shielded():  # the processes that read
+            reading = iter(batches)
         waiting = time.perf_counter()
-        for batch in batches:
+        for batch in reading:
             waited, rate = time.perf_counter() - waiting, float(trainer.schedule.get_last_lr()[0])
             try:
                 update = trainer.update(batch)
@@ -194,7 +224,7 @@ class _Run:
             if self.average and not update.skipped:
                 self.average.update(self.model)
             self.report.updated(self.step, stage.name, rate, update, waited, batch)
-            stopping = self.ranks.any(self.stop.asked)
+            stopping = self.ranks.any(bool(self.stop.asked))
             if stopping or self.step % self.config.run.checkpoint_every == 0 or self.step == self.config.steps:
                 self._save(trainer, must=stopping or self.step == self.config.steps)
             if stopping and self.step < self.config.steps:

@@ -3,14 +3,13 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from vestcl.host_memory import free_memory
-from vestcl.runtime import DeviceError, DeviceInfo, devices, use
-
-if TYPE_CHECKING:  # the others load on first use, for importing torch takes seconds
+if TYPE_CHECKING:  # all load on first use, for importing torch takes seconds
+    from vestcl.host_memory import free_memory
     from vestcl.ops.displace import displace
     from vestcl.ops.rigid_flow import rigid_flow
     from vestcl.ops.splat import Raster, Skipped, composite, rasterize, skipped, splat
     from vestcl.ops.unproject import unproject
+    from vestcl.runtime import DeviceError, DeviceInfo, devices, use
 
 __version__ = "0.1.0"
 __all__ = [
@@ -31,10 +30,16 @@ __all__ = [
 ]
 
 # others are in the file of their own name
-_FILES = dict.fromkeys(("Raster", "Skipped", "composite", "rasterize", "skipped"), "splat")
+_FILES = {
+    **dict.fromkeys(("Raster", "Skipped", "composite", "rasterize", "skipped"), "ops.splat"),
+    **dict.fromkeys(("DeviceError", "DeviceInfo", "devices", "use"), "runtime"),
+    "free_memory": "host_memory",
+}
 
 
 def __getattr__(name: str) -> Any:
+    if name == "runtime":
+        return importlib.import_module("vestcl.runtime")
     if name not in __all__:
         raise AttributeError(f"module 'vestcl' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"vestcl.ops.{_FILES.get(name, name)}"), name)
+    return getattr(importlib.import_module(f"vestcl.{_FILES.get(name, f'ops.{name}')}"), name)

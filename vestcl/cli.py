@@ -1,21 +1,20 @@
-"""The command line: `vestcl forecast`, `prepare`, `devices`, `doctor`, `demo`, `bench`. Torch is imported late."""
+"""The command line: `vestcl forecast`, `prepare`, `devices`, `doctor`, `demo`, `bench`.
+
+Importing this module takes no time: whatever does is imported by `main`, which Ctrl-C ends by one line at any moment.
+"""
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from types import ModuleType
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
-import tyro
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
+from vestcl import interrupt
 
-from vestcl import __version__, doctor, runtime
-from vestcl.st_lpips import Option as StLpipsOption
+if TYPE_CHECKING:
+    from vestcl.commands import Bench, Demo, Devices, Doctor, Forecast, Prepare
+
+__all__ = ["Bench", "Demo", "Devices", "Doctor", "Forecast", "Prepare", "main"]
 
 #: `vestcl bench train-step` is vestcl.bench.train_step; its ``main`` takes a TrainStepBench, may return an exit code.
 _BENCHES: Final = (
@@ -24,271 +23,56 @@ _BENCHES: Final = (
 )
 
 
-@dataclass(frozen=True)
-class Devices:
-    """List the OpenCL devices of this machine."""
-
-    def run(self) -> int:
-        """Print the table."""
-        used = runtime.select()
-        table = Table("", "index", box=box.SIMPLE, padding=0)
-        table.add_column("device, platform, driver", overflow="fold")
-        for heading in ("type", "units", "GiB", "local KiB", "float64", "OpenCL"):
-            table.add_column(heading)
-        for info in runtime.devices():
-            table.add_row(
-                *("*" if info == used else "", info.index),
-                Text(f"{info.name}\n{info.platform} {info.driver.split(' / ')[-1]}"),
-                *(info.kind, str(info.compute_units), f"{info.memory_gib:.1f}", f"{info.local_memory_kib:.0f}"),
-                *("yes" if info.float64 else "no", info.version.split()[1]),
-            )
-        console = Console()
-        console.print(table)
-        console.print("* is in use; VESTCL_DEVICE (an index or a part of a name) chooses another")
-        return 0
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'vestcl.cli' has no attribute {name!r}")
+    return getattr(import_module("vestcl.commands"), name)
 
 
-@dataclass(frozen=True)
-class Doctor:
-    """Try every OpenCL device, each in a process of its own, and tell the remedy for what does not work."""
-
-    timeout: float = 120.0
-    """Seconds that a device may take."""
-
-    def run(self) -> int:
-        """Print what works; 0 if vestcl's default device does, else 1."""
-        console = Console()
-        with console.status("trying every OpenCL device"):
-            report = doctor.examine(self.timeout)
-        table = Table("", "index", "device, platform", *doctor.STEPS, box=box.SIMPLE, padding=0)
-        for device in report.devices:
-            marks = {step.name: "[green]yes[/]" if step.passed else "[red]no[/]" for step in device.steps}
-            used = "*" if device.info.index == report.default else ""
-            name = Text(f"{device.info.name}\n{device.info.platform}")
-            table.add_row(used, device.info.index, name, *(marks.get(step, "-") for step in doctor.STEPS))
-        if report.devices:
-            console.print(table)
-        for device in report.devices:
-            for note in device.notes:
-                console.print(Text(f"{device.info.index} {note}"), soft_wrap=True)
-        for note in report.notes:
-            console.print(Text(note), soft_wrap=True)
-        console.print("[green]vestcl's device works[/]" if report.works else "[red]vestcl's device does not work[/]")
-        others = [device.info.index for device in report.devices if device.works]
-        if others and not report.works:
-            console.print(f"another one does: VESTCL_DEVICE={others[0]}")
-        return 0 if report.works else 1
-
-
-@dataclass(frozen=True)
-class Demo:
-    """Render a procedural street, forecast it and show it from another camera."""
-
-    out: Path = Path("out")
-    """Folder for the pictures."""
-    height: int = 256
-    """Pixels."""
-    width: int = 832
-    """Pixels."""
-    seed: int = 0
-    """Which street."""
-    model: str | None = None
-    """vest-s, a .safetensors file, a checkpoint's folder, or geometric. Without it: vest-s, where it is installed."""
-    quality: Literal["exact", "balanced", "fast"] = "balanced"
-    """How exactly the network computes."""
-    device: str | None = None
-    """OpenCL device: an index of `vestcl devices` or a part of its name."""
-
-    def run(self) -> int:
-        """Write the pictures."""
-        from vestcl import demo
-
-        with runtime.use(self.device):
-            demo.run(self.out, self.height, self.width, self.seed, self.model, self.quality)
-        return 0
-
-
-@dataclass(frozen=True)
-class Forecast:
-    """Forecast the next frames of a driving clip, and show them from other cameras.
-
-    The folder OUT gets pictures, OpenEXR and a video of each view, and forecast.json.
-    """
-
-    input: tyro.conf.Positional[str]
-    """A KITTI raw drive, a KITTI odometry sequence, a frame of Cityscapes, a scene of Virtual KITTI 2, a folder with
-    camera.json, a video, or street:SEED for a procedural street."""
-    out: Path = Path("out")
-    """Folder for the files; those of an earlier forecast are replaced one by one."""
-    steps: int = 5
-    """Frames to forecast."""
-    model: str | None = None
-    """Forecast by a network: vest-s, a .safetensors file, a training checkpoint's folder. Without it: by geometry."""
-    mode: Literal["compose", "feedback"] | None = None
-    """With --model: repeat the first step's motion (compose), or see each forecast frame (feedback). Without it: as the
-    model is meant to, which is feedback for models that start from rest, and compose for vest-s."""
-    perceive: Literal["splatted", "estimated"] | None = None
-    """With mode feedback: depth and mask of forecast frames are splatted, or estimated by --depth-model and
-    --mask-model. Without it: estimated where one of these is given, else splatted."""
-    quality: Literal["exact", "balanced", "fast"] | None = None
-    """With --model: balanced (usual) is within 0.1 dB of exact in PSNR, fast not; docs/time_against_error has both."""
-    view: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Where to look from: source, right, left, or x,y,z[,yaw=][,pitch=][,roll=][,fov=][,name=], as in
-    "0.5,0,0,yaw=-5": metres to the right of, below and ahead of the source camera, and degrees to the right, up and
-    clockwise. Without it: source."""
-    frame: int | None = None
-    """The current frame t, counted from 0; it and the ones before it are seen. Without it: the last one, or with
-    --compare the last that has STEPS true frames after it."""
-    compare: bool = False
-    """Score forecast and baselines (with --model geometry, too) against the frames that the clip goes on with."""
-    squeeze: Path | None = None
-    """With --compare: SqueezeNet 1.0 weights for a distance in its features."""
-    st_lpips: StLpipsOption = None
-    """With --compare: measure ST-LPIPS, by the weights FILE or those inside an installed stlpips-pytorch."""
-    height: int | None = None
-    """Pixels; without it as the clip is, or in proportion to --width."""
-    width: int | None = None
-    """Pixels; without it as the clip is, or in proportion to --height."""
-    fov: float | None = None
-    """Horizontal field of view in degrees, of a video or a folder without camera.json."""
-    depth: Path | None = None
-    """Folder of depth files (.png, .exr, .npy) with the frames' names."""
-    depth_scale: float | None = None
-    """Their units per metre; PNG needs it (KITTI 256)."""
-    labels: Path | None = None
-    """Folder of label PNGs with the frames' names."""
-    label_ids: Literal["trainIds", "labelIds", "virtual_kitti"] = "trainIds"
-    """What they hold."""
-    depth_model: str | None = None
-    """Estimate depth by this checkpoint (a folder, or a name on huggingface.co)."""
-    mask_model: str | None = None
-    """Estimate classes by this checkpoint (a folder, or a name on huggingface.co)."""
-    rig: str | None = None
-    """KITTI: colour or grey cameras."""
-    sequence: str | None = None
-    """KITTI odometry: which one, if there are several."""
-    snippet: str | None = None
-    """Cityscapes: name of the annotated frame, if there are several."""
-    variant: str | None = None
-    """Virtual KITTI: clone, fog ..., if there are several."""
-    gif: bool = False
-    """Write an animated GIF of each view, too."""
-    exr: bool = True
-    """Write each frame's colour, depth, coverage and 3D motion as OpenEXR."""
-    device: str | None = None
-    """OpenCL device: an index of `vestcl devices` or a part of its name."""
-
-    def run(self) -> int:
-        """Forecast and write."""
-        from vestcl import forecast_command
-
-        forecast_command.run(self)
-        return 0
-
-
-@dataclass(frozen=True)
-class Prepare:
-    """Compute depth, masks, inpainting and motion of clips' frames once, for training, evaluation and forecasts.
-
-    Frames that are there, of the same input, are kept; it may be stopped at any moment, and run twice at once.
-    """
-
-    inputs: tyro.conf.Positional[tuple[str, ...]]
-    """Clips, as `vestcl forecast` opens them, or procedural streets: street:SEED, street:FIRST-LAST."""
-    out: Path | None = None
-    """Folder of the cache; a folder in it for each clip. Without it: .vestcl in each input."""
-    height: int = 256
-    """Pixels."""
-    width: int = 832
-    """Pixels."""
-    frames: int = 12
-    """Frames of each street."""
-    samples: int = 2
-    """Streets' colour is the mean over samples x samples rays a pixel."""
-    drive: Literal["usual", "random"] = "usual"
-    """How cameras drive down streets: as the street has it, or drawn at random in the ranges of real cars, from a
-    random time on."""
-    street_depth: Literal["true", "stereo"] = "true"
-    """Where streets' depth comes from: the street itself, or as on the road the matching of its stereo pairs."""
-    shard: str | None = None
-    """I/N, I from 0: every N-th clip from the I-th on. Without it what torchrun tells, if it started this."""
-    workers: int = 1
-    """Processes."""
-    fov: float | None = None
-    """Horizontal field of view in degrees, of a video or a folder without camera.json."""
-    depth: Path | None = None
-    """Folder of depth files (.png, .exr, .npy) with the frames' names."""
-    depth_scale: float | None = None
-    """Their units per metre; PNG needs it (KITTI 256)."""
-    labels: Path | None = None
-    """Folder of label PNGs with the frames' names."""
-    label_ids: Literal["trainIds", "labelIds", "virtual_kitti"] = "trainIds"
-    """What they hold."""
-    depth_model: str | None = None
-    """Estimate depth by this checkpoint (a folder, or a name on huggingface.co)."""
-    mask_model: str | None = None
-    """Estimate classes by this checkpoint (a folder, or a name on huggingface.co)."""
-    rig: str | None = None
-    """KITTI: colour or grey cameras."""
-    sequence: str | None = None
-    """KITTI odometry: which one, if there are several."""
-    snippet: str | None = None
-    """Cityscapes: name of the annotated frame, if there are several."""
-    variant: str | None = None
-    """Virtual KITTI: clone, fog ..., if there are several."""
-
-    def run(self) -> int:
-        """Fill the cache."""
-        from vestcl import prepare_command
-
-        prepare_command.run(self)
-        return 0
-
-
-@dataclass(frozen=True)
-class Bench:
-    """Measure a part of vestcl, `vestcl bench splat` for one; `vestcl bench --help` lists all."""
-
-
+@interrupt.command
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; what a user can put right is told in one line, with exit code 2.
+    """Run one command; an error that the user can correct is one line on stderr, with exit code 2.
 
     Args:
         arguments: the command line; None takes the process's own.
     """
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    try:
-        if arguments == ["--version"]:
-            print(f"vestcl {__version__}")
-            return 0
-        if arguments[:1] == ["bench"]:
-            return _bench(arguments[1:])
-        return _command(arguments)
-    except (runtime.DeviceError, ValueError, OSError) as error:
-        Console(stderr=True).print(Text(f"error: {error}", style="red"), soft_wrap=True)
-        return 2
+    from vestcl import __version__, command_line
+
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:
+        print(f"vestcl {__version__}")
+        return 0
+    parse = _parsed_bench if given[:1] == ["bench"] else _parsed_command
+    return command_line.run(lambda: parse(given), own=arguments is None)
 
 
-def _command(arguments: Sequence[str]) -> int:
-    commands: dict[str, Callable[..., Any]] = {
-        "forecast": Forecast,
-        "prepare": Prepare,
-        "devices": Devices,
-        "doctor": Doctor,
-        "demo": Demo,
-        "bench": Bench,
+def _parsed_command(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
+    """The options, and what to call for them."""
+    from vestcl import command_line, commands
+
+    kinds: dict[str, Callable[..., Any]] = {
+        "forecast": commands.Forecast,
+        "prepare": commands.Prepare,
+        "devices": commands.Devices,
+        "doctor": commands.Doctor,
+        "demo": commands.Demo,
+        "bench": commands.Bench,
     }
-    about = "Forecasts of driving video from new views, in OpenCL. `vestcl --version` tells the version."
-    command = tyro.extras.subcommand_cli_from_dict(commands, prog="vestcl", description=about, args=arguments)
-    return int(command.run())
+    about = "Forecasts of driving video from new views, in OpenCL. `vestcl --version` prints the version."
+    command = command_line.subcommand(kinds, "vestcl", arguments, about)
+    return command, command.run
 
 
-def _bench(arguments: Sequence[str]) -> int:
-    """Import the bench that is asked for and no other, so that one which can't be imported stands in nobody's way."""
-    benches = _benches(sorted({*arguments[:1]} & {*_BENCHES}), asked=True) or _benches(_BENCHES, asked=False)
-    configs: dict[str, Callable[..., Any]] = {name: kind for name, (_, kind) in benches.items()}
-    config = tyro.extras.subcommand_cli_from_dict(configs, prog="vestcl bench", args=arguments)
-    return next(int(module.main(config) or 0) for module, kind in benches.values() if type(config) is kind)
+def _parsed_bench(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
+    """As `_parsed_command`, of the bench that is asked for: one that can't be imported must not stop the others."""
+    from vestcl import command_line
+
+    names = arguments[1:2]
+    benches = _benches(sorted({*names} & {*_BENCHES}), asked=True) or _benches(_BENCHES, asked=False)
+    kinds: dict[str, Callable[..., Any]] = {name: kind for name, (_, kind) in benches.items()}
+    config = command_line.subcommand(kinds, "vestcl bench", arguments[1:])
+    module = next(module for module, kind in benches.values() if type(config) is kind)
+    return config, lambda: int(module.main(config) or 0)
 
 
 def _benches(names: Sequence[str], asked: bool) -> dict[str, tuple[ModuleType, type]]:
@@ -297,7 +81,7 @@ def _benches(names: Sequence[str], asked: bool) -> dict[str, tuple[ModuleType, t
 
 
 def _bench_of(name: str, asked: bool) -> tuple[ModuleType, type] | None:
-    """None where there is none of that name; what is wrong with one that nobody asked for is told, and no error."""
+    """None where there is none of that name; one that nobody asked for and that is broken is a warning, no error."""
     path = f"vestcl.bench.{name.replace('-', '_')}"
     try:
         module = import_module(path)
@@ -305,7 +89,9 @@ def _bench_of(name: str, asked: bool) -> tuple[ModuleType, type] | None:
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and error.name == path:
             return None
-        if asked:
+        if asked or interrupt.is_interrupt(error):
             raise
-        Console(stderr=True).print(Text(f"bench {name} is left out: {error!r}", style="yellow"), soft_wrap=True)
+        from vestcl import command_line
+
+        command_line.print_error(f"bench {name} is left out: {error!r}", "yellow")
         return None

@@ -6,7 +6,6 @@ JSON object a line as they go; the parent reads how far they came.
 """
 
 import dataclasses
-import importlib.util
 import json
 import os
 import signal
@@ -14,22 +13,14 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from vestcl import pocl_cpu, runtime
+from vestcl import icd, pocl_cache, pocl_cpu, runtime
 
 #: What a child tries on its device, in this order; the first failure ends it.
 STEPS: Final = ("build", "run", "float64", "splat")
-
-_VENDORS: Final = "/etc/OpenCL/vendors"
-_NO_POCL: Final = "no OpenCL device: pip install 'pyopencl[pocl]' brings one for the CPU"
-_NO_WORKING_POCL: Final = (
-    "no OpenCL device, though PoCL is installed: let POCL_CACHE_DIR (or else ~/.cache) be a folder that it can write "
-    "to, and unset what is set of POCL_DEVICES, OCL_ICD_VENDORS and OPENCL_VENDOR_PATH"
-)
 
 
 @dataclass(frozen=True)
@@ -75,24 +66,23 @@ def examine(timeout: float = 120.0) -> Report:
     Args:
         timeout: seconds that each child may take.
     """
+    cache = pocl_cache.ensure()  # children inherit a temporary one
     listing = _run_child([sys.executable, "-m", "vestcl.doctor", "list"], timeout)
-    notes = list(_icd_notes(timeout))
+    notes = [*icd.faults(), *_driver_notes(timeout)]
     if listing.ending:
         notes.append(f"listing the devices failed: {listing.ending}")
-        notes.append(f"find the driver at fault: move the .icd files in {vendors()} away one by one")
+        notes.append(f"find the driver at fault: move the .icd files in {icd.vendors()} away one by one")
     infos = [runtime.DeviceInfo(**line["device"]) for line in listing.lines if "device" in line]
     if not infos and not listing.ending:
-        notes.append(_NO_WORKING_POCL if importlib.util.find_spec("pocl_binary_distribution") else _NO_POCL)
+        notes.append(icd.no_device())
+    elif cache.note or cache.fault:
+        notes.append(cache.note or cache.fault)
     notes += [line["error"] for line in listing.lines if infos and "error" in line]
-    if os.environ.get("RUSTICL_ENABLE") is None and any("rusticl" in library.lower() for _, library in _icds()):
+    notes += icd.intel_notes([info.platform for info in infos])
+    if os.environ.get("RUSTICL_ENABLE") is None and any("rusticl" in library.lower() for _, library in icd.drivers()):
         notes.append("rusticl shows no device until it is told which: RUSTICL_ENABLE=llvmpipe, radeonsi, iris, ...")
     default = next((line["default"] for line in listing.lines if "default" in line), None)
     return Report(tuple(_examine_device(info, timeout) for info in infos), default, tuple(notes))
-
-
-def vendors() -> Path:
-    """The folder whose .icd files name the OpenCL drivers of this machine."""
-    return Path(os.environ.get("OCL_ICD_VENDORS") or os.environ.get("OPENCL_VENDOR_PATH") or _VENDORS)
 
 
 # ---------------------------------------------------------------- the parent
@@ -142,19 +132,9 @@ def _examine_device(info: runtime.DeviceInfo, timeout: float) -> DeviceReport:
     return DeviceReport(info, tuple(steps), tuple(notes))
 
 
-def _icds() -> list[tuple[Path, str]]:
-    """Each .icd file and the library that it names."""
-    folder = vendors()
-    if folder.is_file():  # the loader takes it for a driver then
-        return [(folder, str(folder))]
-    return [(file, file.read_text().strip()) for file in sorted(folder.glob("*.icd"))]
-
-
-def _icd_notes(timeout: float) -> Iterator[str]:
-    folder = vendors()
-    if not folder.exists() and str(folder) != _VENDORS:
-        yield f"OCL_ICD_VENDORS names {folder}, which does not exist, and so hides every driver: unset it"
-    for file, library in _icds():
+def _driver_notes(timeout: float) -> Iterator[str]:
+    """The drivers that can't be loaded, each tried in a process of its own."""
+    for file, library in icd.drivers():
         child = _run_child([sys.executable, "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", library], timeout)
         if child.ending:
             yield f"{file} names {library}, which can't be loaded: {child.ending}"

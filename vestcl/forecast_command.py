@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -16,13 +15,15 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from vestcl import compare, forecast_files, pretrained, quality, runtime, sheet
+from vestcl import compare, forecast_checks, forecast_files, pretrained, quality, runtime, sheet
 from vestcl.compare import Comparison
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Skipped, View
+from vestcl.forecast_checks import STREET
 from vestcl.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
 from vestcl.models.trunks import load_trunk
+from vestcl.options import check_pixels
 from vestcl.perceptual import StLpips
 from vestcl.progress import Bar
 from vestcl.views import parse_views
@@ -31,12 +32,12 @@ if TYPE_CHECKING:
     from vestcl import cli
     from vestcl.models.forecaster import Forecaster
 
-#: An input that is no file: the procedural street of this seed.
-STREET: Final = re.compile(r"street:(\d+)")
-
 #: Frames of a street up to the current one where ``frame`` is not told, and its size in pixels: SPEC section 10.
 STREET_CONTEXT: Final = 4
 STREET_SIZE: Final = (256, 832)
+
+#: Frames of a street that is made for one forecast: a quarter of an hour.
+MOST_STREET_FRAMES: Final = 10_000
 
 #: Steps in a table of scores, so that it fits 80 letters; forecast.json has all.
 STEPS_SHOWN: Final = 5
@@ -78,7 +79,7 @@ def run(options: "cli.Forecast") -> None:
         ValueError: an option out of range, or a file that is missing or malformed; the message names it.
         DeviceError: no such OpenCL device.
     """
-    _check(options)
+    forecast_checks.check(options)
     console = Console()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     bar = Bar(*columns, console=console, transient=True, disable=not console.is_terminal)
@@ -92,6 +93,7 @@ def run(options: "cli.Forecast") -> None:
             later = None if model is None else later_frames(model.config, options.mode, options.perceive, *estimators)
             index = current_frame(clip, options)
             views = parse_views(options.view or ("source",), clip[index])
+            forecast_checks.check_memory(options, clip, len(views))
             trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
             st_lpips = None if options.st_lpips is None else StLpips.load(options.st_lpips)
         forecast = _forecast(clip, index, options, views, stages, model, later)
@@ -132,14 +134,16 @@ def open_clip(options: "cli.Forecast", estimators: Estimators | None = None) -> 
         ValueError: as `vestcl.data.open.open_sequence`; an option that a street does not have; an estimator whose
             package or checkpoint is not there.
     """
+    forecast_checks.check_input(options.input)
     street = STREET.fullmatch(options.input)
     beside = {name: getattr(options, name) for name in _BESIDE}
     layout = {name: getattr(options, name) for name in _LAYOUT if getattr(options, name) is not None}
     if street:
         wrong = [*layout, *(name for name, unset in _BESIDE.items() if beside[name] != unset)]
         if wrong:
-            raise ValueError(f"{options.input}: is a street, which takes height and width, not {', '.join(wrong)}")
+            raise ValueError(f"{options.input}: is a street, which takes height, width, not {', '.join(wrong)}")
         return _with_estimates(_street(int(street[1]), options), estimators or load_estimators(options))
+    forecast_checks.check_folders(options)
     clip = _resized(open_sequence(options.input, **beside, **layout), options.height, options.width)
     return _with_estimates(clip, estimators or load_estimators(options))
 
@@ -171,29 +175,13 @@ def current_frame(clip: Clip, options: "cli.Forecast") -> int:
     return index
 
 
-def _check(options: "cli.Forecast") -> None:
-    for name in ("steps", "height", "width"):
-        value = getattr(options, name)
-        if value is not None and value < 1:
-            raise ValueError(f"`{name}` must be 1 or more, got {value}")
-    if options.out.exists() and not options.out.is_dir():
-        raise ValueError(f"`out` must be a folder, got the file {options.out}")
-    for name in ("squeeze", "st_lpips"):
-        if getattr(options, name) is not None and not options.compare:
-            raise ValueError(f"`{name}` is a distance to the truth; it needs `compare`")
-    if options.mode is not None and options.model is None:
-        raise ValueError("`mode` is how a network goes on after its first step; it needs `model`")
-    if options.perceive is not None and options.model is None:
-        raise ValueError("`perceive` is how a network sees its own forecast; it needs `model`")
-    if options.quality is not None and options.model is None:
-        raise ValueError("`quality` is how exactly a network computes; it needs `model`")
-
-
 def _street(seed: int, options: "cli.Forecast") -> Clip:
     from vestcl.data.street import Street
 
     current = STREET_CONTEXT - 1 if options.frame is None else options.frame
     frames = current + 1 + (options.steps if options.compare else 0)
+    if frames > MOST_STREET_FRAMES:
+        raise ValueError(f"`frame` must be below {MOST_STREET_FRAMES:,} in a street, got {current}")
     height, width = (given or usual for given, usual in zip((options.height, options.width), STREET_SIZE, strict=True))
     return Street.generate(seed).clip(max(frames, 1), height, width)
 
@@ -208,6 +196,7 @@ def _resized(clip: Clip, height: int | None, width: int | None) -> Clip:
     elif width is None and height is not None:
         width = max(1, round(sample.width * height / sample.height))
     assert height is not None and width is not None
+    check_pixels(height, width)
     return clip.resized(height, width)
 
 

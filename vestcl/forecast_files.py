@@ -29,7 +29,7 @@ from vestcl import __version__, runtime
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
 from vestcl.forecast import Forecast, Rendered, View
-from vestcl.io.atomic import read_bytes, write_bytes
+from vestcl.io.atomic import read_bytes, remove_leftovers, write_bytes
 from vestcl.io.exr import ExrFrame, read_exr_frame, write_exr_frame
 from vestcl.io.images import read_image, to_pixels, write_image, write_pixels
 from vestcl.io.video_writing import encoder_note, write_gif, write_mp4
@@ -140,11 +140,14 @@ def write_forecast(
         The path of forecast.json.
 
     Raises:
-        ValueError: no frame, one without one of the views, an index outside the clip, a view's name that is no
-            folder's, or a file that can't be written.
+        ValueError: no frame, one without one of the views, an index outside the clip, or a view's name that is no
+            folder's.
+        OSError: a file can't be written, the disk is full for one; the message names it.
     """
     _check(forecast, clip, index, views)
     out, start = Path(out), time.perf_counter()
+    for folder in (out, *(path for path in out.glob("*") if path.is_dir())):
+        remove_leftovers(folder)  # also where this forecast has no view
     (out / JSON).unlink(missing_ok=True)  # an earlier one would vouch for a mixture of two forecasts
     about = _about(forecast, clip, index, details) | {"views": {}}
     for done, view in enumerate(views, start=1):

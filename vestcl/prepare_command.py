@@ -14,9 +14,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from vestcl import interrupt
 from vestcl.data.sample import Clip
 from vestcl.data.street import Street
 from vestcl.data.street_drive import Sway
+from vestcl.forecast_checks import check_file_options
 from vestcl.forecast_command import open_clip
 from vestcl.prepare_clip import Outcome, Report, prepare_clip
 from vestcl.prepare_workers import Task, Told, run_tasks
@@ -26,7 +28,10 @@ if TYPE_CHECKING:
     from vestcl import cli
 
 #: Inputs that are no files: procedural streets by their seeds.
-STREETS: Final = re.compile(r"street:(\d+)(?:-(\d+))?")
+STREETS: Final = re.compile(r"street:(\d{1,18})(?:-(\d{1,18}))?")
+
+#: Streets of one input: more are a slip of the finger, and listing them would not end.
+MOST_STREETS: Final = 100_000
 
 #: Where a data set's cache is without ``out``: in it, or for a file beside it.
 BESIDE: Final = ".vestcl"
@@ -61,14 +66,27 @@ def run(options: "cli.Prepare") -> None:
     hidden = not console.is_terminal or os.environ.get("LOCAL_RANK", "0") != "0"  # one bar a terminal
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     bar = Bar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden)
-    told = Told()
-    with bar:
-        shown = bar.add_task("frames", total=sum(task.frames for task in tasks))
-        advance = functools.partial(bar.advance, shown)
+    told, done, total = Told(), 0, sum(task.frames for task in tasks)
+    with interrupt.summary(lambda: _stopped(done, total)), bar:
+        shown = bar.add_task("frames", total=total)
+
+        def advance() -> None:
+            nonlocal done
+            done += 1
+            bar.advance(shown)
+
         run_tasks(tasks, functools.partial(_prepare, options=options), told, advance, options.workers)
-    _print_end(console, told, tasks, f", shard {part}/{parts}" if parts > 1 else "")
+    if told.computed + told.kept:
+        _print_end(console, told, tasks, f", shard {part}/{parts}" if parts > 1 else "")
     if told.failures:
         raise ValueError("\n".join(told.failures))
+
+
+def _stopped(done: int, total: int) -> str:
+    """The line of a run that Ctrl-C stopped."""
+    if not done:
+        return "stopped; nothing was written"
+    return f"stopped; {done} of {total} frames are prepared, and the same command prepares the others"
 
 
 def shard(told: str | None, environment: Mapping[str, str]) -> tuple[int, int]:
@@ -143,15 +161,11 @@ def open_input(text: str, options: "cli.Prepare") -> Clip:
 
 
 def _check(options: "cli.Prepare") -> None:
-    for name in ("height", "width", "samples", "workers"):
-        if getattr(options, name) < 1:
-            raise ValueError(f"`{name}` must be 1 or more, got {getattr(options, name)}")
+    check_file_options(options)
     if options.frames < 2:
         raise ValueError(f"`frames` must be 2 or more, got {options.frames}")
     if not options.inputs:
         raise ValueError("`inputs` must be one or more clips, got none")
-    if options.out is not None and options.out.exists() and not options.out.is_dir():
-        raise ValueError(f"`out` must be a folder, got the file {options.out}")
 
 
 def _expanded(text: str) -> list[str]:
@@ -162,6 +176,8 @@ def _expanded(text: str) -> list[str]:
     seeds = range(int(streets[1]), int(streets[2] or streets[1]) + 1)
     if not seeds:
         raise ValueError(f"`inputs` must have streets from a lower to a higher seed, got {text}")
+    if len(seeds) > MOST_STREETS:
+        raise ValueError(f"`inputs` must have {MOST_STREETS:,} streets or fewer, got {text}")
     return [f"street:{seed}" for seed in seeds]
 
 

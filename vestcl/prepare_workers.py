@@ -14,6 +14,7 @@ from typing import Final
 import cv2
 import torch
 
+from vestcl import interrupt
 from vestcl.prepare_clip import Outcome, Report
 
 #: Seconds between two looks at what other processes tell.
@@ -92,12 +93,17 @@ def _run_apart(tasks: Sequence[Task], work: Work, told: Told, advance: Advance, 
     """The same in processes of their own."""
     spawn = multiprocessing.get_context("spawn")
     frames: multiprocessing.Queue[bool] = spawn.Queue()
+    others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(workers, spawn, _start_worker, (frames, workers)) as pool:
         try:
             for waits in (False, True):
-                futures = {pool.submit(_work, work, task, waits): task for task in tasks}
+                with interrupt.shielded():  # which starts the processes
+                    futures = {pool.submit(_work, work, task, waits): task for task in tasks}
                 tasks = [futures[done] for done in _finished(futures, frames, advance) if _is_busy(done, told)]
-        except BaseException:
+        except BaseException as error:
+            if interrupt.is_interrupt(error):  # nobody waits for the clips that are being prepared
+                for process in set(multiprocessing.active_children()) - others:
+                    process.terminate()
             pool.shutdown(cancel_futures=True)
             raise
 

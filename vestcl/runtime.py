@@ -17,9 +17,9 @@ import ctypes
 import functools
 import os
 import re
-import shutil
 import threading
 import time
+import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.tools
 
-from vestcl import constants, pocl_cpu
+from vestcl import constants, icd, pocl_cache, pocl_cpu
 from vestcl.robust_lock import Holder, RobustLock, WithBlock
 
 Defines = Mapping[str, str | int]
@@ -142,6 +142,9 @@ if hasattr(os, "register_at_fork"):
 def _all_devices() -> tuple[tuple[DeviceInfo, cl.Device], ...]:
     global _opencl_runs
     _opencl_runs = True
+    cache = pocl_cache.ensure()  # PoCL reads where it is when it is loaded
+    if pocl_cache.wrappers_cache_fault():
+        cl._PYOPENCL_NO_CACHE = True  # of PYOPENCL_NO_CACHE, which is read when pyopencl is imported
     try:
         platforms = cl.get_platforms()
     except cl.LogicError as error:  # the loader's way to say that there are none
@@ -158,6 +161,8 @@ def _all_devices() -> tuple[tuple[DeviceInfo, cl.Device], ...]:
             if pocl_cpu.is_unnamed(platform.version, device.version):
                 pocl_cpu.name_cpu(device.int_ptr)
             found.append((_describe(f"{p}:{d}", platform, device), device))
+    if cache.note and any("PoCL" in info.version for info, _ in found):
+        warnings.warn(cache.note, stacklevel=2)
     return tuple(found)
 
 
@@ -198,10 +203,10 @@ def select(selector: str | None = None) -> DeviceInfo:
     Raises:
         DeviceError: no device fits, and the message lists those that there are; or as in `devices`.
     """
-    selector = selector or os.environ.get("VESTCL_DEVICE")
+    name, selector = ("`device`", selector) if selector else ("VESTCL_DEVICE", os.environ.get("VESTCL_DEVICE"))
     infos = devices()
     if not infos:
-        raise DeviceError("no OpenCL device found: `pip install 'pyopencl[pocl]'` brings one for the CPU")
+        raise DeviceError(icd.no_device())
     if selector is None:
         return min(infos, key=lambda info: (info.kind != "CPU", "PoCL" not in info.version))
     if re.fullmatch(r"\d+:\d+", selector):
@@ -211,7 +216,7 @@ def select(selector: str | None = None) -> DeviceInfo:
         chosen = [i for i in infos if text in f"{i.platform} {i.name} {i.version} {i.driver}".lower()]
     if not chosen:
         known = "; ".join(f"{info.index} {info.platform} / {info.name}" for info in infos)
-        raise DeviceError(f"VESTCL_DEVICE or selector {selector!r} fits none of the OpenCL devices: {known}")
+        raise DeviceError(f"{name} {selector!r} fits none of the OpenCL devices: {known}")
     return chosen[0]
 
 
@@ -281,8 +286,8 @@ def current() -> "Session":
 @functools.cache
 def open_session(info: DeviceInfo, mapping: str) -> "Session":
     device = next(device for known, device in _all_devices() if known == info)
-    if "PoCL" in info.version and shutil.which("ld") is None:
-        raise DeviceError("PoCL calls the linker `ld`, which is not on PATH, and would abort: apt install binutils")
+    if "PoCL" in info.version and (fault := icd.linker_fault() or pocl_cache.ensure().fault):
+        raise DeviceError(fault)
     return Session(info, mapping, device)
 
 
@@ -410,6 +415,8 @@ class Session:
     def _build(self, file: str, defines: Defines) -> cl.Program:
         if defines.get("REAL") == "double" and not self.info.float64:
             raise DeviceError(f"{self.info.name} has no float64: pass float32, or choose another of `vestcl devices`")
+        if "PoCL" in self.info.version and (fault := pocl_cache.fault_before_build()):
+            raise DeviceError(fault)
         options = ["-cl-std=CL1.2", *(f"-D{key}={value}" for key, value in defines.items())]
         # The CPU that name_cpu() gave is not in the key of PoCL's own disk cache: a comment puts it there.
         text = f"// {pocl_cpu.host_key()}\n{source(file)}"

@@ -26,7 +26,7 @@ _ANGLES: Final = ("yaw", "pitch", "roll")
 _KEYS: Final = (*_ANGLES, "fov", "name")
 
 #: A view's name is a folder's, so it neither leads elsewhere nor hides.
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}")
 
 _WANTED: Final = (
     '"source", "right", "left" or "x,y,z[,yaw=deg][,pitch=deg][,roll=deg][,fov=deg][,name=...]" with metres to the '
@@ -110,10 +110,12 @@ def check_name(name: str) -> None:
     """Refuse a view's name that is no plain folder name.
 
     Raises:
-        ValueError: empty, or with something else than letters, digits and "._+-", or with one of these four first.
+        ValueError: empty, of more than 100 letters, with something else than letters, digits and "._+-", with one of
+            these four first, or the name of forecast.json.
     """
-    if not _NAME.fullmatch(name):
-        raise ValueError(f"`view` must have a name of letters, digits and '._+-' that starts with one, got {name!r}")
+    if not _NAME.fullmatch(name) or name.lower() == "forecast.json":
+        wanted = "a name of letters, digits and '._+-', at most 100, that starts with one of the former"
+        raise ValueError(f"`view` must have {wanted}, got {name[:120]!r}")
 
 
 def _of_rig(word: str, sample: Sample) -> View:
@@ -167,6 +169,8 @@ def _pose(position: NDArray[np.float64], degrees: dict[str, float]) -> NDArray[n
 
 def _zoomed(text: str, fov: str, sample: Sample) -> NDArray[np.float64]:
     degrees = _number(text, fov)
+    if not 0 < degrees < 180:
+        raise ValueError(f"`view` {text!r}: its `fov` must be between 0 and 180 degrees, got {degrees:g}")
     focal = calibration.intrinsics_from_fov(degrees, sample.height, sample.width)[0, 0]
     (fx, _, cx), (_, fy, cy), _ = sample.K
     return calibration.intrinsics(focal, focal * fy / fx, cx, cy)

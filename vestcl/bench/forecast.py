@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, ClassVar, Final, Literal
 
 import tyro
 from rich.console import Console
@@ -24,6 +24,7 @@ from vestcl.data import Street
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.forecast import View
+from vestcl.forecast_checks import check_input
 from vestcl.geometric import Perception
 from vestcl.io.atomic import write_bytes
 from vestcl.models.trunks import Trunk, load_trunk
@@ -39,7 +40,10 @@ HELD_OUT: Final = range(1000, 1020)
 #: Columns where the tables don't go to a terminal, whose own number counts there: three horizons of five metrics.
 WIDTH: Final = 170
 
-_STREETS: Final = re.compile(r"street:(?:(\d+)(?:-(\d+))?)?")
+#: Steps that tables show where none are chosen.
+HORIZONS: Final = (1, 3, 5)
+
+_STREETS: Final = re.compile(r"street:(?:(\d{1,18})(?:-(\d{1,18}))?)?")
 
 
 @dataclass(frozen=True)
@@ -51,8 +55,8 @@ class ForecastBench:
     the twenty that are held out."""
     steps: int = 5
     """Frames to forecast in each window."""
-    horizons: tuple[int, ...] = (1, 3, 5)
-    """Steps that tables show; files have all."""
+    horizons: tuple[int, ...] = ()
+    """Steps that tables show; files have all. Without it 1, 3 and 5, as far as STEPS goes."""
     every: int = 1
     """Take every such window."""
     first: int = 1
@@ -85,6 +89,13 @@ class ForecastBench:
     """JSON file for the scores of every window, and their means."""
     markdown: Path | None = None
     """File for the tables as Markdown."""
+
+    OUTPUT_FILES: ClassVar = ("out",)
+
+    @property
+    def shown(self) -> tuple[int, ...]:
+        """Steps that tables show."""
+        return self.horizons or tuple(k for k in HORIZONS if k <= self.steps)
 
 
 @dataclass(frozen=True)
@@ -122,7 +133,7 @@ def main(config: ForecastBench) -> None:
         networks = _networks(config)
         groups = _groups(config)
         _run(groups, config, networks, console)
-    grids = [grid for group in groups for grid in _grids(group, config.horizons)]
+    grids = [grid for group in groups for grid in _grids(group, config.shown)]
     for grid in grids:
         console.print(tables.to_rich(grid))
     if networks.squeeze is None:
@@ -141,7 +152,7 @@ def _check(config: ForecastBench) -> None:
             raise ValueError(f"`{name}` must be 1 or more, got {getattr(config, name)}")
     if not config.inputs:
         raise ValueError("`inputs` must be one or more clips, got none")
-    if not config.horizons or not all(1 <= k <= config.steps for k in config.horizons):
+    if not all(1 <= k <= config.steps for k in config.horizons):
         raise ValueError(f"`horizons` must be steps, 1 ... {config.steps}, got {config.horizons}")
     if not config.views or len(set(config.views)) < len(config.views):
         raise ValueError(f"`views` must be one or more cameras, each once, got {config.views}")
@@ -177,6 +188,7 @@ def clips_of(text: str, config: ForecastBench) -> list[Clip]:
     """
     streets = _STREETS.fullmatch(text)
     if streets is None:
+        check_input(text)
         clips = [open_sequence(text)]
     else:
         first, last = streets[1], streets[2] or streets[1]

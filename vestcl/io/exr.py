@@ -6,7 +6,9 @@ Colour follows OpenEXR's custom: linear light, Rec. 709 primaries. Ours is displ
 reading undoes it. It is not multiplied by `A`.
 """
 
+import errno
 import io
+import os
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
@@ -39,6 +41,10 @@ _COMMENT: Final = (
 )
 
 
+#: Errors of the operating system that end a write.
+_WRITE_ERRORS: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
+
+
 @dataclass(frozen=True, eq=False)
 class ExrFrame:
     """One forecast frame, of any floating dtype; what is None has no channel in the file."""
@@ -63,6 +69,7 @@ def write_exr(path: str | Path, channels: Mapping[str, ArrayLike], comment: str 
 
     Raises:
         ValueError: no channel, another suffix, a channel that is not [H, W] or of another size.
+        OSError: the file can't be written, the disk is full for one; the message names it.
     """
     if Path(path).suffix.lower() != ".exr":
         raise ValueError(f"{path}: must end in .exr")
@@ -79,7 +86,10 @@ def write_exr(path: str | Path, channels: Mapping[str, ArrayLike], comment: str 
     if not comment:
         del header["comments"]
     with replacing(path) as temporary, OpenEXR.File(header, {k: _storable(a) for k, a in arrays.items()}) as file:
-        file.write(str(temporary))
+        try:
+            file.write(str(temporary))
+        except RuntimeError as error:
+            raise _os_error(error, path) from error
 
 
 def read_exr(path: str | Path) -> dict[str, NDArray[np.generic]]:
@@ -113,6 +123,7 @@ def write_exr_frame(path: str | Path, frame: ExrFrame) -> None:
 
     Raises:
         ValueError: an array of another shape than `ExrFrame` tells, sizes that differ, or nothing to write.
+        OSError: as `write_exr`.
     """
     channels: dict[str, NDArray[np.float32]] = {}
     for field, names in CHANNELS.items():
@@ -187,6 +198,12 @@ def _silent() -> Iterator[None]:
     with redirect_stdout(io.StringIO()) as printed:
         yield
     print(printed.getvalue(), end="")  # another thread's, where no error came
+
+
+def _os_error(error: RuntimeError, path: str | Path) -> OSError:
+    """What OpenEXR's error says in words, as the operating system's error; EIO where the words are its own."""
+    code = next((code for code in _WRITE_ERRORS if os.strerror(code).lower() in str(error).lower()), errno.EIO)
+    return OSError(code, os.strerror(code), str(path))
 
 
 def _storable(array: NDArray[np.generic]) -> NDArray[np.generic]:

@@ -6,12 +6,16 @@ processors only the configuration is read: the classes differ between its versio
 
 import importlib
 import json
+import os
 import re
+import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlsplit
+from urllib.request import getproxies
 
 from torch import nn
 
@@ -20,6 +24,9 @@ _PREPARATION: Final = "preprocessor_config.json"
 
 #: owner/name, or a name alone, as the hub has had at first.
 _HUB_NAME: Final = re.compile(r"\w[\w.-]*(/\w[\w.-]*)?")
+
+#: Where the hub is, if HF_ENDPOINT does not name a mirror.
+_HUB: Final = "https://huggingface.co"
 
 #: Characters of transformers' own message that are passed on: it may list hundreds of networks.
 _REASON: Final = 200
@@ -53,6 +60,9 @@ class Checkpoint:
             ValueError: no such checkpoint, files missing or damaged, or a network of another type.
         """
         transformers, name = _transformers(), str(name_or_path)
+        local_files_only = (
+            local_files_only or not _hub_is_known()
+        )  # else each file is asked for again for half a minute
         with _explained(name):
             config = transformers.AutoConfig.from_pretrained(name, local_files_only=local_files_only)
         if config.model_type not in networks:
@@ -87,6 +97,18 @@ class Checkpoint:
         if broken:
             raise ValueError(f"{self.name}: weights must be finite, got NaN or infinity in {_first(broken)}")
         return model.eval().requires_grad_(False).to(device)
+
+
+def _hub_is_known() -> bool:
+    """Whether the hub's name leads to an address, here or by a proxy."""
+    host = urlsplit(os.environ.get("HF_ENDPOINT", _HUB)).hostname
+    if host is None or getproxies():
+        return True
+    try:
+        socket.getaddrinfo(host, 443)
+    except OSError:
+        return False
+    return True
 
 
 def _transformers() -> Any:

@@ -1,0 +1,99 @@
+"""What `vestcl forecast` and `prepare` refuse before they start: inputs that are no clips, options that need others."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from vestcl import cli
+    from vestcl.data.sample import Clip
+
+#: An input that is no file: the procedural street of this seed.
+STREET: Final = re.compile(r"street:(\d{1,18})")
+
+#: What an input is not, though it looks like one that vestcl could open.
+_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://.*", re.DOTALL)
+
+#: Bytes of a forecast frame per pixel and view: colour, depth, coverage and 3D motion, float32.
+_RESULT_BYTES: Final = 4 * (3 + 1 + 1 + 3)
+
+
+def check_input(text: str) -> None:
+    """Refuse inputs of the command line that are no paths and no streets.
+
+    Raises:
+        ValueError: a street without a seed, or a URL.
+    """
+    if _URL.fullmatch(text):
+        raise ValueError(f"{text}: is a URL, and vestcl opens files only: download it first")
+    if text.startswith("street:") and not STREET.fullmatch(text) and not Path(text).exists():
+        raise ValueError(f"{text}: must be street:SEED, as street:3 (prepare takes street:FIRST-LAST, too)")
+
+
+def check_file_options(options: "cli.Forecast | cli.Prepare") -> None:
+    """Refuse options about files that are not given.
+
+    Raises:
+        ValueError: units without depth files, or a kind of labels without label files.
+    """
+    if options.depth_scale is not None and options.depth is None:
+        raise ValueError("`depth_scale` is the units of depth files; it needs `depth`")
+    if options.label_ids != "trainIds" and options.labels is None:
+        raise ValueError("`label_ids` is what label files hold; it needs `labels`")
+
+
+def check_folders(options: "cli.Forecast") -> None:
+    """Refuse folders of depth or label files that are none.
+
+    Raises:
+        ValueError: no such folder, or a file.
+    """
+    for name in ("depth", "labels"):
+        folder: Path | None = getattr(options, name)
+        if folder is not None and not folder.is_dir():
+            what = "is no folder" if folder.exists() else "does not exist"
+            raise ValueError(f"`{name}` must be a folder of files with the frames' names, and {folder} {what}")
+
+
+def check(options: "cli.Forecast") -> None:
+    """Refuse options that need others.
+
+    Raises:
+        ValueError: the message names both.
+    """
+    check_file_options(options)
+    for name in ("squeeze", "st_lpips"):
+        if getattr(options, name) is not None and not options.compare:
+            raise ValueError(f"`{name}` is a distance to the truth; it needs `compare`")
+    if options.mode is not None and options.model is None:
+        raise ValueError("`mode` is how a network goes on after its first step; it needs `model`")
+    if options.perceive is not None and options.model is None:
+        raise ValueError("`perceive` is how a network sees its own forecast; it needs `model`")
+    if options.quality is not None and options.model is None:
+        raise ValueError("`quality` is how exactly a network computes; it needs `model`")
+
+
+def check_memory(options: "cli.Forecast", clip: "Clip", views: int) -> None:
+    """Refuse a forecast whose frames do not fit into the memory that is free.
+
+    Raises:
+        ValueError: they do not.
+    """
+    height, width = clip[0].height, clip[0].width
+    wanted = options.steps * views * height * width * _RESULT_BYTES
+    free = _free_memory()
+    if free is not None and wanted > free:
+        size = f"{options.steps} steps of {views} views of {height} x {width} px"
+        raise ValueError(
+            f"--steps: {size} take {wanted / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
+            "take fewer steps or a smaller --height"
+        )
+
+
+def _free_memory() -> int | None:
+    """Bytes that can be had without swapping; None where the system does not say."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) << 10 for line in lines if line.startswith("MemAvailable:")), None)
