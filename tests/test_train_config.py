@@ -260,7 +260,7 @@ def test_the_papers_settings(path: Path) -> None:
     assert config.data.flip == path.stem.endswith("mirrored")
     stages = [stage.name for stage in config.stages]
     assert stages == (["ego", "all"] if path.stem.endswith("two-stages") else ["all"])
-    windows = {"street": 400, "kitti": 6894, "cityscapes": 2975}[path.stem.split("_")[1]]
+    windows = {"street": 400, "kitti": 6894, "kitti-views": 5949, "cityscapes": 2975}[path.stem.split("_")[1]]
     assert config.steps == 300 * windows // 4
 
 
