@@ -11,8 +11,9 @@ from checkpoint_states import state_of
 from forecaster_scenes import TINY
 
 from train import checkpoint, export
+from vestcl import io
 from vestcl.data import Street
-from vestcl.io import depth, exr, images, video
+from vestcl.io import depth, exr, images
 from vestcl.io.atomic import write_bytes
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare_clip import prepare_clip
@@ -30,8 +31,8 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "bytes": lambda path: write_bytes(path / "file", b"content"),
     "png": lambda path: images.write_pixels(path / "a.png", PICTURE),
     "jpg": lambda path: images.write_pixels(path / "a.jpg", PICTURE),
-    "mp4": lambda path: video.write_mp4(path / "a.mp4", [PICTURE] * 2, 10.0),
-    "gif": lambda path: video.write_gif(path / "a.gif", [PICTURE] * 2, 10.0),
+    "mp4": lambda path: io.write_mp4(path / "a.mp4", [PICTURE] * 2, 10.0),
+    "gif": lambda path: io.write_gif(path / "a.gif", [PICTURE] * 2, 10.0),
     "exr": lambda path: exr.write_exr(path / "a.exr", {"R": np.zeros((4, 4), np.float32)}),
     "depth": lambda path: depth.write_depth(path / "a.npy", np.ones((1, 4, 4), np.float32)),
     "model": lambda path: export_model(path / "half.safetensors"),

@@ -13,9 +13,9 @@ from vestcl.prepared import PreparedClip, find_prepared
 
 
 def test_too_short_clips_say_how_many_frames_are_needed() -> None:
-    with pytest.raises(ValueError, match="`clips` must have 5 frames or more, got 4 in the longest clip"):
+    with pytest.raises(ValueError, match="`clips` must have 5 frames or more without a gap, got 4 in the longest clip"):
         fakes(3, 4, horizons=(1, 1, 1))
-    with pytest.raises(ValueError, match=r"`clips` must have 3 frames or more within frames 8 \.\.\. 9, got 20"):
+    with pytest.raises(ValueError, match=r"`clips` must have 3 frames or more within frames 8 \.\.\. 9 without a gap"):
         fakes(20, frames=(8, 9))
     with pytest.raises(ValueError, match="`clips` must be one or more, got none"):
         fakes()
