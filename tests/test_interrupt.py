@@ -20,10 +20,14 @@ NOTHING = "stopped; nothing was written\n"
 
 #: A command with a child process and a file that is half written, when it says "ready".
 BUSY = """
-import subprocess, sys, time
+import signal, subprocess, sys, time
 from pathlib import Path
 from vestcl import interrupt
 from vestcl.io.atomic import replacing, write_bytes
+
+def work():
+    for _ in range(6000):
+        time.sleep(0.01)
 
 @interrupt.command
 def main(arguments):
@@ -32,15 +36,15 @@ def main(arguments):
     with replacing(out / "second") as temporary:
         temporary.write_bytes(b"ha")
         if arguments is None:
+            signal.signal(signal.SIGCHLD, lambda *_: 1 / 0)  # torch's raises, too
             child = subprocess.Popen(["sleep", "60"])
             print("ready", child.pid, flush=True)
             try:
-                while True:
-                    time.sleep(1)
+                work()
             except BaseException:  # what other code may do with an exception that it knows nothing of
-                time.sleep(60)
+                work()
         print("ready", flush=True)
-        time.sleep(60)
+        work()
     return 0
 
 sys.exit(main(None if sys.argv[2] == "own" else []))

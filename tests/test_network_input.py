@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from vestcl import geometry
 from vestcl.data import Street
-from vestcl.forecast import View
-from vestcl.geometric import Perception, forecast_frames
+from vestcl.geometric import Perception
 from vestcl.models.ego_motion import RigidMotion
 from vestcl.models.forecaster import Forecaster
 from vestcl.network_input import as_motion, last_motions, network_input
 from vestcl.prepared import Prepared, prepare_frame
+from vestcl.scene.ego_motion import constant_velocity
 from vestcl.scene.layers import Layers
 
 HEIGHT, WIDTH = 8, 12
@@ -96,11 +96,11 @@ def test_the_last_two_motions_are_told() -> None:
     assert all(torch.equal(one, other) for one, other in zip(prior[1], prior[2], strict=True))
 
 
-def test_prior_is_the_geometric_forecasts_motion() -> None:
+def test_prior_is_the_measured_motion_at_constant_velocity() -> None:
     perception = Perception(Street.generate(3).clip(4, 48, 160, samples=1))
     prev, cur = prepare_frame(perception, 1), prepare_frame(perception, 2)
     got = geometry.compose_rigid(*network_input(prev, cur, last_motions(prev, cur)).prior.next_from_cur)[0]
-    wanted = forecast_frames(perception, 2, 1, [View("source", np.eye(4))]).future_from_cur[0]
+    wanted = constant_velocity([np.linalg.inv(perception.prev_from_cur(index)) for index in (1, 2)])
     np.testing.assert_allclose(got.numpy(), wanted, rtol=0, atol=1e-6)
     assert abs(wanted[2, 3]) > 0.1
 

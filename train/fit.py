@@ -127,10 +127,15 @@ def _last_state(config: Config, go_on: bool) -> State | None:
 
 
 class _Stop:
-    """Set by SIGTERM and SIGINT: the update that is being made is still made. A second SIGINT is not waited for."""
+    """Set by SIGTERM and SIGINT: the update that is being made is still made.
+
+    A second SIGINT, and one before the first update, ends the run at once.
+    """
 
     asked = 0
     """The signal."""
+    updated = False
+    """Whether there is an update that a checkpoint would keep."""
 
     def __init__(self) -> None:
         numbers = (number for number in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(number) != signal.SIG_IGN)
@@ -138,7 +143,7 @@ class _Stop:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         before = self._before.get(signal.Signals(number))
-        if self.asked == number == signal.SIGINT and callable(before):
+        if number == signal.SIGINT and (self.asked == number or not self.updated) and callable(before):
             before(number, frame)
         self.asked = number
 
@@ -221,6 +226,7 @@ class _Run:
             except NotANumberError as error:
                 raise TrainingError(self._broken(str(error), batch.clips)) from error
             self.step += 1
+            self.stop.updated = True
             if self.average and not update.skipped:
                 self.average.update(self.model)
             self.report.updated(self.step, stage.name, rate, update, waited, batch)

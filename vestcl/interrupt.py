@@ -121,6 +121,9 @@ def shielded() -> Iterator[None]:
 
     The parent gets it when the block ends.
     """
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # which unblocks SIGINT when it starts: before, not in the block
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -162,8 +165,10 @@ def stop_now(number: int = signal.SIGINT, frame: "FrameType | None" = None) -> N
     if os.getpid() != _owner:  # a fork: its parent prints
         os._exit(STOPPED)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # torch's raises where a process that reads data ends
     try:
-        _end_children()
+        with contextlib.suppress(Exception):
+            _end_children()
         _release_semaphores()
         line = _clean_up()
         with contextlib.suppress(Exception):

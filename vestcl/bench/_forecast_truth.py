@@ -150,7 +150,7 @@ def _cloud(colour: NDArray[np.float32], points: Array, moved: Array, which: NDAr
     rows, columns = np.nonzero(which)
     there, came = (each[:, rows, columns].T.astype(np.float32) for each in (moved, moved - points))
     z_src = points[2, rows, columns].astype(np.float32)
-    return Cloud(there, z_src, colour[:, rows, columns].T, came, rows, columns)
+    return Cloud(there, z_src, colour, came, rows, columns)
 
 
 def _motion(cur: Sample, after: Sample) -> NDArray[np.float32]:
