@@ -51,7 +51,7 @@ def test_a_pixel_changes_the_keys_of_the_frames_that_see_it() -> None:
     assert differ(before, frame_keys(clip_of(images.copy()))) == []
     for frame, seen_by in ((7, [7]), (3, [3, 4, 5, 6]), (1, [0, 1, 2, 3, 4]), (0, [0, 1, 2, 3])):
         after = images.copy()
-        after[frame, 2, 1, 3] = np.nextafter(after[frame, 2, 1, 3], 2)
+        after[frame, 2, 1, 3] = np.nextafter(after[frame, 2, 1, 3], np.float32(2))
         assert differ(before, frame_keys(clip_of(after))) == seen_by
 
 
