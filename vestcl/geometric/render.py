@@ -6,6 +6,7 @@ their position t: each says of the pixel p that its surface was seen at s + A (p
 is exact to first order whatever the weights are. The colour is taken from there.
 """
 
+import functools
 from dataclasses import dataclass
 from typing import Final
 
@@ -120,7 +121,7 @@ def _splat(
         [colour, inverse[:, None], cloud.step_xyz, _origins(cloud, points_uv[0], zoom, whole)], axis=1
     )
     image, coverage = vestcl.splat(points_uv, z, radii, opacities, features[None], height, width)
-    mean = image[0] / np.maximum(coverage[0], np.float32(1e-6))
+    mean = np.ascontiguousarray(image[0]) / np.maximum(coverage[0], np.float32(1e-6))
     mean[:3] = _colour(mean, cloud.image)
     return mean[:7] * coverage[0], coverage[0]
 
@@ -133,12 +134,12 @@ def _origins(
     A is the inverse of dt/ds, by central differences over the image that the points come from. Where they tear, or a
     neighbour is not ``solid`` [N], the colours around a point are not all its surface's: |s|^2 is larger by _EDGE.
     """
-    rows, columns = cloud.rows + 1, cloud.columns + 1
-    places = np.full((2, cloud.image.shape[1] + 2, cloud.image.shape[2] + 2), np.nan, np.float32)
-    places[:, rows, columns] = np.where(solid, points_uv.T, np.float32(np.nan))
+    height, width = cloud.image.shape[1] + 2, cloud.image.shape[2] + 2
+    at = (cloud.rows + 1) * width + cloud.columns + 1
+    places = np.full((2, height * width), np.nan, np.float32)
+    places[:, at] = np.where(solid, points_uv.T, np.float32(np.nan))
     (a, c), (b, d) = (
-        (places[:, rows + down, columns + right] - places[:, rows - down, columns - right]) / 2
-        for down, right in ((0, 1), (1, 0))
+        [(plane.take(at + step) - plane.take(at - step)) / np.float32(2) for plane in places] for step in (1, width)
     )
     growth, alike = a * d - b * c, 1 / np.maximum(zoom, np.float32(1e-3))
     longest = np.square(np.maximum(zoom, np.float32(1))) * constants.TORN**2
@@ -149,7 +150,7 @@ def _origins(
     seen = np.stack([cloud.columns, cloud.rows]).astype(np.float32) + np.float32(0.5)
     u, v = points_uv.T
     start = [seen[0] - slope[0] * u - slope[1] * v, seen[1] - slope[2] * u - slope[3] * v]
-    squared = (seen**2).sum(0) + np.where(whole, 0, np.float32(_EDGE))
+    squared = seen[0] ** 2 + seen[1] ** 2 + np.where(whole, 0, np.float32(_EDGE))
     return np.stack([*start, *slope, *seen, squared / np.float32(_SQUARED)], axis=1).astype(np.float32)
 
 
@@ -159,8 +160,8 @@ def _colour(mean: NDArray[np.float32], image: NDArray[np.float32]) -> NDArray[np
     y, x = np.mgrid[:height, :width].astype(np.float32) + np.float32(0.5)
     start, slope, seen, squared = mean[7:9], mean[9:13], mean[13:15], mean[15] * np.float32(_SQUARED)
     u, v = start[0] + slope[0] * x + slope[1] * y, start[1] + slope[2] * x + slope[3] * y
-    one = np.hypot(u - seen[0], v - seen[1]) < _EXTRAPOLATED
-    one &= squared - (seen**2).sum(0) < _ONE_SURFACE**2
+    one = (u - seen[0]) ** 2 + (v - seen[1]) ** 2 < _EXTRAPOLATED**2
+    one &= squared - seen[0] ** 2 - seen[1] ** 2 < _ONE_SURFACE**2
     there = [cv2.remap(plane, u - 0.5, v - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in image]
     return np.where(one, np.stack(there), mean[:3])
 
@@ -172,21 +173,24 @@ def _surface(
 
     A surface that turns towards the camera is stretched by more than what it comes nearer by: spacing >= ``zoom``.
     """
-    rows, columns = cloud.rows + 1, cloud.columns + 1
-    places = np.full((2, rows.max(initial=0) + 2, columns.max(initial=0) + 2), np.nan, np.float32)
-    places[:, rows, columns] = points_uv.T
+    height, width = cloud.image.shape[1] + 2, cloud.image.shape[2] + 2
+    at = (cloud.rows + 1) * width + cloud.columns + 1
+    places = np.full((2, height * width), np.nan, np.float32)
+    places[:, at] = points_uv.T
+    mine = np.ascontiguousarray(points_uv.T)
     steps = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
-    beside = [
-        np.square(places[:, rows + down, columns + right] - points_uv.T).sum(0) / (down * down + right * right)
-        for down, right in steps
-    ]
+    beside = []
+    for down, right in steps:
+        across, along = (plane.take(at + (down * width + right)) - own for plane, own in zip(places, mine, strict=True))
+        beside.append((across * across + along * along) / np.float32(down * down + right * right))
     limit = np.square(np.maximum(zoom, np.float32(1)))
-    count = (np.stack(beside) < constants.TORN**2 * limit).sum(0)
-    line = np.stack([np.maximum(one, other) for one, other in zip(beside[:4], beside[:3:-1], strict=True)])
-    whole = (count >= _NEIGHBOURS) | (line < _LINE**2 * limit).any(0)
+    near = np.float32(constants.TORN**2) * limit
+    count = np.add.reduce([one < near for one in beside], axis=0, dtype=np.uint8)
+    line = functools.reduce(np.fmin, map(np.maximum, beside[:4], beside[:3:-1]))
+    whole = (count >= _NEIGHBOURS) | (line < np.float32(_LINE**2) * limit)
     above, left, right, below = (beside[steps.index(step)] for step in ((-1, 0), (0, -1), (0, 1), (1, 0)))
-    spacing = np.stack([np.fmin(above, below), np.fmin(left, right)])
-    spacing = np.where(spacing < constants.TORN**2 * limit, spacing, 0).max(0)
+    gaps = (np.fmin(above, below), np.fmin(left, right))
+    spacing = np.maximum(*(np.where(gap < near, gap, np.float32(0)) for gap in gaps))
     return whole, np.maximum(zoom, np.sqrt(spacing)).astype(np.float32)
 
 
