@@ -24,8 +24,9 @@ lint: venv
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy vestcl train
 
+# torch's OpenMP workers would spin on the cores that OpenCL's threads need.
 test: lint
-	$(BIN)/pytest -q
+	OMP_WAIT_POLICY=passive $(BIN)/pytest -q
 
 # The tests with the lowest versions that setup.py admits, on Python 3.10 or 3.11; torch is the same as in .venv.
 test-lowest: $(LOWEST)/.installed
