@@ -115,8 +115,8 @@ def test_estimators_see_forecast_frames(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--mode", "compose", "--perceive", "splatted"], '`perceive` must not be given with mode "compose"'),
-        (["--perceive", "estimated"], '`perceive` "estimated" needs --depth-model, --mask-model or both'),
+        (["--mode", "compose", "--perceive", "splatted"], '--perceive must not be given with mode "compose"'),
+        (["--perceive", "estimated"], '--perceive "estimated" needs --depth-model, --mask-model or both'),
     ],
 )
 def test_what_cannot_be_perceived(
