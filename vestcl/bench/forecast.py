@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from vestcl import peer, runtime
 from vestcl.bench import _forecast_tables as tables
@@ -30,6 +30,7 @@ from vestcl.io.atomic import write_bytes
 from vestcl.models.trunks import Trunk, load_trunk
 from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.perceptual import StLpips
+from vestcl.progress import Bar
 from vestcl.scoring import SOURCE, Record, Truth
 from vestcl.st_lpips import Option as StLpipsOption
 from vestcl.views import parse_views
@@ -219,7 +220,7 @@ def windows_of(clip: Clip, config: ForecastBench) -> list[int]:
 def _run(groups: Sequence[_Group], config: ForecastBench, networks: Networks, console: Console) -> None:
     """Fill the groups."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal)
+    bar = Bar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal)
     with bar:
         total = sum(len(windows_of(clip, config)) for group in groups for clip in group.clips)
         task = bar.add_task("windows", total=total)

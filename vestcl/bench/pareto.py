@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from vestcl import pretrained, quality, runtime
 from vestcl.bench import _pareto_plots, _pareto_report, _pareto_splatter, _results, _timing
@@ -16,6 +16,7 @@ from vestcl.bench._pareto_measure import Bench, measure, recursions
 from vestcl.bench._pareto_scenes import scene
 from vestcl.bench._results import Results
 from vestcl.models.fast import accelerate
+from vestcl.progress import Bar
 
 #: Horizons that the two ways of going on from t + 1 are compared at.
 HORIZONS: Final = (1, 3, 5)
@@ -76,7 +77,7 @@ def main(config: ParetoBench) -> None:
     console = _results.console()
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with (
-        Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
+        Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
         _timing.torch_threads(config.threads),
         _timing.recycling_allocator(),
     ):
