@@ -26,7 +26,7 @@ class Export:
     out: tyro.conf.Positional[Path]
     """The file to write, *.safetensors."""
 
-    OUTPUT_FILES: ClassVar = ("out",)
+    OUTPUT_FILES: ClassVar[tuple[str, ...]] = ("out",)
 
 
 @interrupt.command

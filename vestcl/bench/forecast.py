@@ -91,7 +91,7 @@ class ForecastBench:
     markdown: Path | None = None
     """File for the tables as Markdown."""
 
-    OUTPUT_FILES: ClassVar = ("out",)
+    OUTPUT_FILES: ClassVar[tuple[str, ...]] = ("out",)
 
     @property
     def shown(self) -> tuple[int, ...]:
