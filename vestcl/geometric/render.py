@@ -126,6 +126,19 @@ def _splat(
     return mean[:7] * coverage[0], coverage[0]
 
 
+def _on_grid(cloud: Cloud, planes: NDArray[np.float32]) -> tuple[NDArray[np.intp], int, NDArray[np.float32]]:
+    """Where points are in their image with a border of one pixel, flat [N], its width, and ``planes`` [2, N] there.
+
+    Returns:
+        Indices, the width, and [2, (H + 2) (W + 2)], NaN where no point is.
+    """
+    height, width = cloud.image.shape[1] + 2, cloud.image.shape[2] + 2
+    at = (cloud.rows + 1) * width + cloud.columns + 1
+    grid = np.full((2, height * width), np.nan, np.float32)
+    grid[:, at] = planes
+    return at, width, grid
+
+
 def _origins(
     cloud: Cloud, points_uv: NDArray[np.float32], zoom: NDArray[np.float32], solid: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
@@ -134,10 +147,7 @@ def _origins(
     A is the inverse of dt/ds, by central differences over the image that the points come from. Where they tear, or a
     neighbour is not ``solid`` [N], the colours around a point are not all its surface's: |s|^2 is larger by _EDGE.
     """
-    height, width = cloud.image.shape[1] + 2, cloud.image.shape[2] + 2
-    at = (cloud.rows + 1) * width + cloud.columns + 1
-    places = np.full((2, height * width), np.nan, np.float32)
-    places[:, at] = np.where(solid, points_uv.T, np.float32(np.nan))
+    at, width, places = _on_grid(cloud, np.where(solid, points_uv.T, np.float32(np.nan)))
     (a, c), (b, d) = (
         [(plane.take(at + step) - plane.take(at - step)) / np.float32(2) for plane in places] for step in (1, width)
     )
@@ -173,11 +183,8 @@ def _surface(
 
     A surface that turns towards the camera is stretched by more than what it comes nearer by: spacing >= ``zoom``.
     """
-    height, width = cloud.image.shape[1] + 2, cloud.image.shape[2] + 2
-    at = (cloud.rows + 1) * width + cloud.columns + 1
-    places = np.full((2, height * width), np.nan, np.float32)
-    places[:, at] = points_uv.T
     mine = np.ascontiguousarray(points_uv.T)
+    at, width, places = _on_grid(cloud, mine)
     steps = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
     beside = []
     for down, right in steps:
