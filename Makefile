@@ -4,6 +4,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 LOWEST := .venv-lowest
 OUT ?= out
+# Tests run in this many processes; a file's tests stay in one of them.
+TEST_PROCESSES ?= 2
+PYTEST_OPTIONS := -q -n $(TEST_PROCESSES) --dist loadfile
 
 .PHONY: venv demo test lint test-lowest bench stress oclgrind devices-test clean
 
@@ -26,11 +29,11 @@ lint: venv
 
 # torch's OpenMP workers would spin on the cores that OpenCL's threads need.
 test: lint
-	OMP_WAIT_POLICY=passive $(BIN)/pytest -q
+	OMP_WAIT_POLICY=passive $(BIN)/pytest $(PYTEST_OPTIONS)
 
 # The tests with the lowest versions that setup.py admits, on Python 3.10 or 3.11; torch is the same as in .venv.
 test-lowest: $(LOWEST)/.installed
-	$(LOWEST)/bin/pytest -q
+	OMP_WAIT_POLICY=passive $(LOWEST)/bin/pytest $(PYTEST_OPTIONS)
 
 $(LOWEST)/.installed: setup.py constraints.txt tests/lowest_versions.py
 	$(PYTHON) -m venv $(LOWEST)
