@@ -10,6 +10,7 @@ import torch
 from st_lpips_weights import public_state
 
 from vestcl import cli, metrics, peer, perceptual
+from vestcl.bench import _forecast_run as running
 from vestcl.bench import _forecast_tables as tables
 from vestcl.bench import _forecast_truth as known
 from vestcl.bench import _forecast_windows as windows
@@ -196,17 +197,17 @@ def test_tables_by_hand() -> None:
 
 def test_windows_have_a_frame_before_and_steps_after() -> None:
     clip = street_clip(frames=6)
-    assert list(bench.windows_of(clip, ForecastBench(("x",), steps=2))) == [1, 2, 3]
-    assert list(bench.windows_of(clip, ForecastBench(("x",), steps=1, first=2, every=2))) == [2, 4]
-    assert list(bench.windows_of(clip, ForecastBench(("x",), steps=1, last=2))) == [1, 2]
+    assert list(running.windows_of(clip, ForecastBench(("x",), steps=2))) == [1, 2, 3]
+    assert list(running.windows_of(clip, ForecastBench(("x",), steps=1, first=2, every=2))) == [2, 4]
+    assert list(running.windows_of(clip, ForecastBench(("x",), steps=1, last=2))) == [1, 2]
 
 
 def test_inputs() -> None:
     config = ForecastBench(("x",), **TINY)
-    names = [clip.name for clip in bench.clips_of("street:4-6", config)]
+    names = [clip.name for clip in running.clips_of("street:4-6", config)]
     assert names == ["street 4", "street 5", "street 6"]
-    assert [clip.name for clip in bench.clips_of("street:7", config)] == ["street 7"]
-    assert [clip.name for clip in bench.clips_of("street:", config)] == [f"street {seed}" for seed in HELD_OUT]
+    assert [clip.name for clip in running.clips_of("street:7", config)] == ["street 7"]
+    assert [clip.name for clip in running.clips_of("street:", config)] == [f"street {seed}" for seed in HELD_OUT]
 
 
 @pytest.mark.parametrize(
@@ -260,5 +261,5 @@ def test_the_command_line_reaches_it(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_pooled_inputs_share_a_table() -> None:
     config = ForecastBench(("street:4", "street:5"), **TINY, pool=True)
-    (group,) = bench._groups(config)
-    assert [clip.name for clip in group.clips] == ["street 4", "street 5"]
+    (group,) = running.groups_of(config)
+    assert [clip.name for clip, _ in group.clips] == ["street 4", "street 5"]

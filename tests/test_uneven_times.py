@@ -13,6 +13,7 @@ from video_files import write_video
 
 from train.data import WindowSet
 from vestcl import baselines, cli, compare, network, pretrained
+from vestcl.bench import _forecast_run as running
 from vestcl.bench import forecast as bench
 from vestcl.data import Street
 from vestcl.data.calibration import power
@@ -200,7 +201,7 @@ def test_truth_is_the_frame_at_that_time() -> None:
 
 def test_windows_with_a_gap_are_left_out(tmp_path: Path) -> None:
     clip = uneven()
-    assert bench.windows_of(clip, bench.ForecastBench(("x",), steps=2)) == [4, 7, 8]
+    assert running.windows_of(clip, bench.ForecastBench(("x",), steps=2)) == [4, 7, 8]
     small = clip.resized(24, 80)
     prepare_clip(small, tmp_path)
     cache = PreparedClip.open(tmp_path)

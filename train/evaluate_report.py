@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
 from train.evaluate_inputs import label_of, plain
-from train.evaluate_statistics import Difference, Interval, differences, intervals, unit
 from train.evaluate_windows import CONSTANT_VELOCITY
 from train.protocols import PAPER_NOTE, Protocol
 from vestcl.scoring import (
@@ -26,6 +25,7 @@ from vestcl.scoring import (
     summarise,
     to_markdown,
 )
+from vestcl.scoring.statistics import Difference, Interval, cell, differences, drawn, interval_grid, intervals
 
 #: What models are held against: the forecast without weights and, for the camera's motion, where that takes it from.
 _BASELINES: Final = (GEOMETRIC, CONSTANT_VELOCITY)
@@ -109,14 +109,8 @@ def _with_notes(grid: Grid, results: Results) -> Grid:
 
 
 def _interval_grid(view: str, records: Sequence[Record], results: Results) -> Grid:
-    steps, metrics = steps_of(records, results.horizons), headline(records)
-    rows = []
-    for (_, method), own in by_method(records).items():
-        found = intervals(own)
-        cells = [_cell(found[m][k - own[0].first], METRICS[m].digits) for m in metrics for k in steps]
-        rows.append((method, *cells))
-    heading = ("", *(f"{METRICS[m].label} {horizon(k)}" for m in metrics for k in steps))
-    return Grid(f"{results.protocol.title}, view {view}, mean and 95 % interval", heading, tuple(rows), _drawn(records))
+    title = f"{results.protocol.title}, view {view}, mean and 95 % interval"
+    return interval_grid(title, records, results.horizons, headline(records))
 
 
 def _difference_grids(results: Results) -> list[Grid]:
@@ -128,13 +122,13 @@ def _difference_grids(results: Results) -> list[Grid]:
             baseline = _baseline(model, methods)
             for metric, found in differences(methods[model], methods[baseline]).items() if baseline else ():
                 shown = [found[k - of_view[0].first] for k in steps]
-                cells = (f"{_cell(d.interval, '+' + METRICS[metric].digits)}, {d.better:.0%}" for d in shown)
+                cells = (f"{cell(d.interval, '+' + METRICS[metric].digits)}, {d.better:.0%}" for d in shown)
                 of_baseline.setdefault(str(baseline), []).append((f"{model}, {METRICS[metric].label}", *cells))
         for baseline, rows in of_baseline.items():
             title = f"{results.protocol.title}, view {view}, model less {baseline}"
             notes = ("Each: mean difference, its 95 % interval, share of windows where the model is better.",)
             heading = ("", *map(horizon, steps))
-            made.append(Grid(title, heading, tuple(rows), (*notes, *_drawn(of_view))))
+            made.append(Grid(title, heading, tuple(rows), (*notes, drawn(of_view))))
     return made
 
 
@@ -182,19 +176,6 @@ def _paper_grids(results: Results) -> list[Grid]:
         lines.append((f"{method}, view {view}", *cells))
     heading = ("", *(f"{METRICS[m].label} {horizon(k)}" for m in metrics for k in steps))
     return [Grid(results.protocol.title + _PAPER, heading, tuple(lines), (PAPER_NOTE,))]
-
-
-def _cell(interval: Interval, digits: str) -> str:
-    """ "0.812 [0.801, 0.823]" """
-    mean, low, high = (number(value, digits) for value in interval)
-    return "-" if mean == "-" else f"{mean} [{low}, {high}]"
-
-
-def _drawn(records: Sequence[Record]) -> tuple[str, ...]:
-    count = len({record.clip for record in records})
-    if unit(records) == "clips":
-        return (f"Intervals: bootstrap over {count} clips, with all of their windows.",)
-    return ("Intervals: bootstrap over the windows of one clip. They resemble each other, so it is too narrow.",)
 
 
 # ---------------------------------------------------------------- files

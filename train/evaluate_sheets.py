@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.evaluate_inputs import label_of, plain
-from train.evaluate_statistics import extremes
 from train.evaluate_windows import Setup, forecast, perceptions_of, prepared, views_of
 from train.protocols import Source
 from vestcl import sheet
 from vestcl.io.images import write_pixels
 from vestcl.scoring import GEOMETRIC, METRICS, Record, Truth
+from vestcl.scoring.statistics import extremes
 from vestcl.sheet import Cell, Picture
 
 

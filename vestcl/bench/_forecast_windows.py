@@ -4,15 +4,16 @@ Pictures are made at the clip's own size.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl import peer
+from vestcl import network, peer
 from vestcl.forecast import Forecast, View
 from vestcl.geometric import Perception, forecast_frames
+from vestcl.models.forecaster import Forecaster
 from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.scoring import GEOMETRIC, ORACLE, SOURCE, Prediction, Predictions, Record, Timed, Truth, look, score
 from vestcl.scoring import predictions as all_predictions
@@ -44,6 +45,7 @@ def predict(
     views: Sequence[View],
     future_from_cur: Sequence[NDArray[np.float64]] | None = None,
     flow: VoxelFlowNetwork | None = None,
+    models: Mapping[str, Forecaster] | None = None,
 ) -> tuple[Predictions, Forecast]:
     """All methods on one window.
 
@@ -55,6 +57,7 @@ def predict(
         views: cameras to judge from, each one of the rig's.
         future_from_cur: the true motion of the camera a step, [4, 4] m, for a forecast that is told it.
         flow: the network of `vestcl.peer`, as a baseline.
+        models: trained networks, by the name of their row.
 
     Returns:
         The pictures, and the geometric forecast.
@@ -65,6 +68,11 @@ def predict(
         made = peer.forecast_frames(perception, flow, index, steps, views)
         looking = max(plain.seconds - plain.forecast.seconds["render"], 0.0) if "geometry" in made.seconds else 0.0
         forecasts |= {peer.METHOD: Timed(made, looking + time.perf_counter() - start)}
+    for name, model in (models or {}).items():
+        start, plain = time.perf_counter(), forecasts[GEOMETRIC]
+        made = network.forecast_frames(perception, model, index, steps, views)
+        looking = max(plain.seconds - plain.forecast.seconds["render"], 0.0)
+        forecasts |= {name: Timed(made, looking + time.perf_counter() - start)}
     return all_predictions(truth, index, steps, views, forecasts), forecasts[GEOMETRIC].forecast
 
 

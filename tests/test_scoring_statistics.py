@@ -1,10 +1,10 @@
-"""train.evaluate_statistics on numbers that can be worked out by hand."""
+"""vestcl.scoring.statistics on numbers that can be worked out by hand."""
 
 import numpy as np
 import pytest
 
-from train.evaluate_statistics import Interval, bootstrap, differences, extremes, intervals, unit
 from vestcl.scoring import Record
+from vestcl.scoring.statistics import Interval, bootstrap, differences, extremes, intervals, unit
 
 
 def record(clip: str, index: int, method: str = "a", **scores: list[float]) -> Record:

@@ -14,7 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.scoring import METRICS, Record
+from vestcl.scoring.pictures import Record
+from vestcl.scoring.tables import METRICS, Grid, by_method, horizon, number, steps_of
 
 #: Draws: the ends of an interval then vary by some hundredths of its width.
 RESAMPLES: Final = 2000
@@ -78,6 +79,37 @@ def intervals(records: Sequence[Record]) -> dict[str, list[Interval]]:
     clips = [record.clip for record in records]
     shown = [metric for metric in METRICS if all(metric in record.scores for record in records)]
     return {metric: bootstrap([record.scores[metric] for record in records], clips) for metric in shown}
+
+
+def interval_grid(title: str, records: Sequence[Record], horizons: Sequence[int], metrics: Sequence[str]) -> Grid:
+    """A table of `intervals`: a row a method, for each metric a column a horizon.
+
+    Args:
+        title: of the table.
+        records: of one view.
+        horizons: the steps to show; those that the view does not have are left out.
+        metrics: that all records have.
+    """
+    steps, rows = steps_of(records, horizons), list[tuple[str, ...]]()
+    for (_, method), own in by_method(records).items():
+        found = intervals(own)
+        rows.append((method, *(cell(found[m][k - own[0].first], METRICS[m].digits) for m in metrics for k in steps)))
+    heading = ("", *(f"{METRICS[m].label} {horizon(k)}" for m in metrics for k in steps))
+    return Grid(title, heading, tuple(rows), (drawn(records),))
+
+
+def cell(interval: Interval, digits: str) -> str:
+    """ "0.812 [0.801, 0.823]" """
+    mean, low, high = (number(value, digits) for value in interval)
+    return "-" if mean == "-" else f"{mean} [{low}, {high}]"
+
+
+def drawn(records: Sequence[Record]) -> str:
+    """The note of a table with intervals."""
+    if unit(records) == "clips":
+        count = len({record.clip for record in records})
+        return f"Intervals: bootstrap over {count} clips, with all of their windows."
+    return "Intervals: bootstrap over the windows of one clip. They resemble each other, so it is too narrow."
 
 
 def differences(records: Sequence[Record], baseline: Sequence[Record]) -> dict[str, list[Difference]]:
