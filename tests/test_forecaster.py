@@ -244,3 +244,17 @@ def test_what_is_seen_is_never_hidden_by_what_is_inpainted() -> None:
         side = splat_cloud(cloud, Camera(still, K), K, still, config, 9, 9)
         middle = torch.cat([side.features, side.colour], dim=1)[0, :, 4, 4]
         assert torch.allclose(middle, wanted[0], atol=0.2) and side.coverage[0, 0, 4, 4] > 0.8
+
+
+@pytest.mark.parametrize("stretched", [False, True])
+def test_points_that_pass_the_camera_do_not_become_balls(stretched: bool) -> None:
+    """Of 10 m and of 0.5 m in front of it: at half the distance a point counts, at a twentieth it does not."""
+    K, still, one = camera(1, 9, 9), torch.eye(4)[None], torch.ones(1, 1)
+    config, covered = RenderConfig(rho=1.0, stretched=stretched), []
+    for distance in (5.0, 0.5):
+        points, white, starts = torch.tensor([[0, 0, distance]]), torch.ones(1, 3), torch.tensor([0, 1])
+        size, seen = torch.tensor([10.0]), torch.zeros(1, dtype=torch.bool)
+        cloud = Cloud(points, torch.zeros(1, 3), torch.zeros(1, 3), size, one, white, one, seen, (), starts)
+        side = splat_cloud(cloud, Camera(still, K), K, still, config, 9, 9)
+        covered.append(float(side.coverage[0, 0, 4, 4]))
+    assert covered[0] > 0.8 and (covered[1] == 0) == stretched

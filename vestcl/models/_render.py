@@ -120,7 +120,8 @@ def splat_cloud(
     """Show a cloud in ``camera``: opaque points of radius r = rho z_src / z_tgt f_tgt / f_src, clamped to RADIUS.
 
     With ``config.stretched`` r grows with the distance to what was beside a point, and points that nothing is beside
-    any more are left out: see `_surface`.
+    any more are left out: see `_surface`. So are points that come so near that r would be beyond RADIUS before: a ball
+    of that size hides what it is not.
 
     Args:
         cloud: of B images.
@@ -146,6 +147,7 @@ def splat_cloud(
     magnified, opacities = zoom_of_point * cloud.depth / near, torch.ones_like(z)
     if config.stretched:
         factor, opacities = _surface(points_uv.detach(), magnified.detach(), cloud.grids)
+        opacities = opacities * (config.rho * magnified.detach() <= RADIUS[1])
         magnified = magnified * factor
     radii = (config.rho * magnified).clamp(*RADIUS)
     order = z.detach()
