@@ -123,6 +123,7 @@ def together(rng: Rng, folder: Path) -> Case:
             ),
             *("--device 99:0", "--frame 99", "--compare --steps 99", "--compare --steps 1 --view 0,0,1", "--gif yes"),
             *("--depth-model nowhere", "--mask-model nowhere", "--label-ids abacus", "--mode neither", "--dance"),
+            *("--score-size 256 832", "--score-size 0 9 --compare --steps 1", "--score-size 256"),
             *("--model nowhere", "--model file.pth", "--quality best", "--view", "--steps", "second.input"),
         ),
     )

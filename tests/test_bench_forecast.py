@@ -218,6 +218,7 @@ def test_inputs() -> None:
         ({"views": ()}, "`views`"),
         ({"inputs": ()}, "`inputs`"),
         ({"inputs": ("street:5-4",)}, "lower to a higher seed"),
+        ({"inputs": ("street:5-999999999999",)}, "1,000 streets or fewer"),
         ({"street_frames": 3}, "must have 4 frames"),
         ({"first": 9}, "must have 12 frames"),
     ],

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from vestcl import metrics
-from vestcl.compare import FLOW, FORECAST, REPEAT, compare, comparison_sheet
+from vestcl.compare import FLOW, FORECAST, ORACLE, OTHER_CAMERA, REPEAT, compare, comparison_sheet
 from vestcl.data.calibration import translation
+from vestcl.data.resize import resize_image
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageArray
 from vestcl.forecast import Forecast, Rendered, View
@@ -53,7 +54,25 @@ def test_each_view_is_held_against_its_own_camera() -> None:
         for method, image in ((FORECAST, noise(102 + step)), (REPEAT, noise(1))):
             pair = (metrics.quantise(torch.from_numpy(array)[None]) for array in (image, noise(2 + step)))
             assert source.scores[method][step]["psnr"] == pytest.approx(float(metrics.psnr(*pair)))
-        assert np.array_equal(right.images[REPEAT][step], noise(101))
+        assert np.array_equal(right.images[REPEAT + OTHER_CAMERA][step], noise(1))
+    assert list(right.images) == [FORECAST, REPEAT + OTHER_CAMERA, FLOW + OTHER_CAMERA, ORACLE]
+    assert list(source.scores) == [FORECAST, REPEAT, FLOW]
+
+
+def test_the_oracle_has_the_right_cameras_past() -> None:
+    """A static rig: of the right camera's image its own last frame is right, the left one's is not."""
+    clip = make_clip(still=True)
+    (right,) = compare(make_forecast(views := parse_views(["right"], clip), [noise(9)]), clip, 1, views)
+    assert right.scores[ORACLE][0]["psnr"] > 40 and right.scores[FLOW + OTHER_CAMERA][0]["psnr"] < 10
+
+
+def test_scores_are_taken_at_the_size_asked_for() -> None:
+    clip = make_clip()
+    views = parse_views(["source"], clip)
+    (comparison,) = compare(make_forecast(views, [noise(1)]), clip, 1, views, size=(16, 24))
+    pair = [metrics.quantise(torch.from_numpy(resize_image(noise(seed), 16, 24))[None]) for seed in (1, 2)]
+    assert comparison.scores[FORECAST][0]["psnr"] == pytest.approx(float(metrics.psnr(*pair)))
+    assert comparison.images[FORECAST][0].shape == comparison.truth[0].shape == (3, HEIGHT, WIDTH)
 
 
 def test_a_street_that_stands_still_is_repeated() -> None:

@@ -135,6 +135,9 @@ class Forecast:
     """With --compare: SqueezeNet 1.0 weights for a distance in its features."""
     st_lpips: StLpipsOption = None
     """With --compare: measure ST-LPIPS, by the weights FILE or those inside an installed stlpips-pytorch."""
+    score_size: tuple[int, int] | None = None
+    """With --compare: height and width in pixels that images are scored at; without it the clip's. `vestcl bench
+    forecast` scores at 256 832."""
     height: int | None = None
     """Pixels; without it as the clip is, or in proportion to --width."""
     width: int | None = None

@@ -1,32 +1,44 @@
 """A forecast beside what then happened, and beside forecasts that need neither depth nor weights."""
 
-import functools
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from vestcl import baselines, metrics, sheet
-from vestcl.data.sample import Clip, RightCamera, Sample
+from vestcl import sheet
+from vestcl.data.sample import Clip, RightCamera
 from vestcl.forecast import Forecast, View
 from vestcl.models.trunks import Trunk
-from vestcl.perceptual import StLpips, squeeze_distance
+from vestcl.perceptual import StLpips
+from vestcl.scoring.pictures import FLOW, ORACLE, OTHER_CAMERA, REPEAT, Timed, Truth, predictions, score
 from vestcl.sheet import Cell, Picture
 from vestcl.views import seen_by
+
+__all__ = [
+    "FLOW",
+    "FORECAST",
+    "METRICS",
+    "ORACLE",
+    "OTHER_CAMERA",
+    "REPEAT",
+    "Comparison",
+    "compare",
+    "comparison_sheet",
+]
 
 Images = list[NDArray[np.float32]]
 """[3, H, W] RGB in [0, 1], a step each."""
 
+Value = TypeVar("Value")
+
 Scores = dict[str, list[dict[str, float]]]
 """method -> step -> metric -> number."""
 
-#: The methods of every comparison, the forecast first.
+#: The forecast, the first method of every comparison.
 FORECAST: Final = "forecast"
-REPEAT: Final = "repeat last"
-FLOW: Final = "optical flow"
 
 #: Metric -> how tables call it, with the digits that tell methods apart.
 METRICS: Final = {
@@ -48,7 +60,8 @@ class Comparison:
     truth: Images
     scores: Scores
     stereo: bool
-    """Whether the truth is the right camera's."""
+    """Whether the truth is the right camera's. `ORACLE` is then optical flow of its own past, which no other method has
+    seen."""
 
 
 def compare(
@@ -59,11 +72,11 @@ def compare(
     trunk: Trunk | None = None,
     report: Callable[[float], None] | None = None,
     st_lpips: StLpips | None = None,
+    size: tuple[int, int] | None = None,
 ) -> list[Comparison]:
     """Score every view that a camera of the rig really saw, step by step as long as the clip has a frame at that time.
 
-    The baselines get the two last frames of the camera that they are held against: for the right camera its own, which
-    the forecast has never seen. That makes them a bar to pass, not a rival of equal means.
+    Baselines and scores are those of `vestcl.scoring`, as `vestcl bench forecast` and `train.evaluate` have them.
 
     Args:
         forecast: frames at t+1, ... with every view.
@@ -71,14 +84,15 @@ def compare(
         index: of the frame t in ``clip``, 1 or more.
         views: the cameras; those that nobody looked from are passed over.
         trunk: SqueezeNet 1.0, for the squeeze distance (`vestcl.perceptual.squeeze_distance`).
-        report: told the share of the views that are done, 0 to 1.
+        report: is given the share of the steps that are done, 0 to 1.
         st_lpips: for ST-LPIPS (`vestcl.perceptual.StLpips`).
+        size: (height, width) px that images are resized to and scored at; None is the clip's.
 
     Returns:
         A comparison for each view that has a truth.
 
     Raises:
-        ValueError: no frame before or after t, no view with a truth, or pictures of another size than the truth.
+        ValueError: no frame before or after t, no view with a truth, or images of another size than the truth.
 
     Source: SPEC section 10.
     """
@@ -92,12 +106,26 @@ def compare(
     known = [view for view in views if seen_by(view, clip[index]) is not None]
     if not known:
         raise ValueError('`views` must have one with a truth to compare with: "source", or "right" of a stereo clip')
-    comparisons = []
-    for done, view in enumerate(known, start=1):
-        comparisons.append(_compare_view(forecast, clip, index, view, _Networks(trunk, st_lpips)))
-        if report is not None:
-            report(done / len(known))
-    return comparisons
+    later = clip.after(index, len(forecast.frames))
+    forecast = dataclasses.replace(forecast, frames=forecast.frames[: len(later)])
+    truth = Truth(clip, size or (clip[0].height, clip[0].width), trunk, st_lpips=st_lpips)
+    made = predictions(truth, index, len(later), known, {FORECAST: Timed(forecast, 0.0)})
+    records = score(truth, index, known, made, forecast, later=later, report=report)
+    scores: dict[str, Scores] = {}
+    for record in records:
+        shown = {metric: values for metric, values in record.scores.items() if metric in METRICS}
+        steps = [{metric: values[step] for metric, values in shown.items()} for step in range(len(later))]
+        scores.setdefault(record.view, {})[record.method] = steps
+    return [
+        Comparison(
+            view.name,
+            _forecast_first({method: list(of.pictures) for method, of in made[view.name].items()}),
+            [truth.full(view, at) for at in later],
+            _forecast_first(scores[view.name]),
+            isinstance(seen_by(view, clip[index]), RightCamera),
+        )
+        for view in known
+    ]
 
 
 def comparison_sheet(comparison: Comparison, title: str = "") -> Picture:
@@ -120,56 +148,10 @@ def comparison_sheet(comparison: Comparison, title: str = "") -> Picture:
         error = np.abs(comparison.images[FORECAST][step] - truth).mean(axis=0, keepdims=True)
         shown = [cell(FORECAST), Cell(sheet.rgb(truth), f"t+{step + 1}  truth"), Cell(sheet.heat(error), "error")]
         rows.append([*shown, *(cell(method) for method in comparison.images if method != FORECAST)])
-    note = "; the baselines see the right camera's own past frames, the forecast does not" if comparison.stereo else ""
+    note = "; all but the oracle see the left camera's frames only" if comparison.stereo else ""
     scale = ("error of the forecast: 0", f"{sheet.WORST_ERROR} of the range and more")
     return sheet.sheet(rows, title=f"{title}{note}", bar=scale)
 
 
-class _Networks(NamedTuple):
-    """That images are compared by, as far as their weights are known."""
-
-    squeeze: Trunk | None
-    st_lpips: StLpips | None
-
-
-def _compare_view(forecast: Forecast, clip: Clip, index: int, view: View, networks: _Networks) -> Comparison:
-    later = clip.after(index, len(forecast.frames))
-    steps = len(later)
-    previous, current, *truth = (_read(view, clip[at]) for at in (index - 1, index, *later))
-    images = {FORECAST: [frame[view.name].image for frame in forecast.frames[:steps]]}
-    flow = functools.partial(baselines.flow_extrapolation, elapsed=clip.elapsed(index))
-    for name, forecaster in ((REPEAT, baselines.repeat_last), (FLOW, flow)):
-        images[name] = list(forecaster(_batch(previous), _batch(current), steps)[0].numpy())
-    scores = {
-        method: [_scores(image, wanted, networks) for image, wanted in zip(of_method, truth, strict=True)]
-        for method, of_method in images.items()
-    }
-    return Comparison(view.name, images, truth, scores, isinstance(seen_by(view, clip[index]), RightCamera))
-
-
-def _read(view: View, sample: Sample) -> NDArray[np.float32]:
-    camera = seen_by(view, sample)
-    if camera is None:
-        raise ValueError(f"sample {sample.name} has no picture from view {view.name}, as its neighbours have")
-    return camera.read_image()
-
-
-def _scores(image: NDArray[np.float32], truth: NDArray[np.float32], networks: _Networks) -> dict[str, float]:
-    """All metrics that the size allows."""
-    pair = metrics.quantise(_batch(image)), metrics.quantise(_batch(truth))
-    side = min(truth.shape[1:])
-    scores = {"psnr": metrics.psnr(*pair)}
-    if side >= metrics.WINDOW:
-        scores["ssim"] = metrics.ssim(*pair)
-    if side >= metrics.MS_SSIM_SIDE:
-        scores["ms_ssim"] = metrics.ms_ssim(*pair)
-    with torch.no_grad():
-        if networks.st_lpips is not None:
-            scores["st_lpips"] = networks.st_lpips(*pair)
-        if networks.squeeze is not None:
-            scores["squeeze"] = squeeze_distance(*pair, networks.squeeze)
-    return {name: float(score) for name, score in scores.items()}
-
-
-def _batch(image: NDArray[np.float32]) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(image))[None]
+def _forecast_first(by_method: Mapping[str, Value]) -> dict[str, Value]:
+    return {FORECAST: by_method[FORECAST], **by_method}

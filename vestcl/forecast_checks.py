@@ -4,6 +4,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from vestcl.options import check_pixels
+
 if TYPE_CHECKING:
     from vestcl import cli
     from vestcl.data.sample import Clip
@@ -65,6 +67,12 @@ def check(options: "cli.Forecast") -> None:
     for name in ("squeeze", "st_lpips"):
         if getattr(options, name) is not None and not options.compare:
             raise ValueError(f"`{name}` is a distance to the truth; it needs `compare`")
+    if options.score_size is not None:
+        if not options.compare:
+            raise ValueError("`score_size` is the size that images are compared at; it needs `compare`")
+        check_pixels(*options.score_size, name="`score_size`")
+        if min(options.score_size) < 1:
+            raise ValueError(f"`score_size` must be 1 px or more, got {options.score_size}")
     if options.mode is not None and options.model is None:
         raise ValueError("`mode` is how a network goes on after its first step; it needs `model`")
     if options.perceive is not None and options.model is None:

@@ -101,10 +101,10 @@ def run(options: "cli.Forecast") -> None:
         comparisons = []
         if options.compare:
             with stages.stage("compare") as report:
-                comparisons = compare.compare(forecast, clip, index, views, trunk, report, st_lpips)
+                comparisons = compare.compare(forecast, clip, index, views, trunk, report, st_lpips, options.score_size)
                 if model is not None:
                     rival = _forecast(clip, index, options, views, stages)
-                    rivals = compare.compare(rival, clip, index, views, trunk, st_lpips=st_lpips)
+                    rivals = compare.compare(rival, clip, index, views, trunk, None, st_lpips, options.score_size)
                     comparisons = [_beside(*pair, rival.method) for pair in zip(comparisons, rivals, strict=True)]
         with stages.stage(forecast_files.WRITING) as report:
             details = _details(options, clip, index, forecast, comparisons, later)
@@ -287,7 +287,7 @@ def _score_table(comparison: Comparison, later: LaterFrames | None) -> Table:
     """A block of rows a metric, a row a method, a column a step: the first, the last and some between."""
     count = len(comparison.truth)
     shown = sorted({round(1 + (count - 1) * part / (STEPS_SHOWN - 1)) for part in range(STEPS_SHOWN)})
-    note = "; baselines: the right camera's own past" if comparison.stereo else ""
+    note = "; oracle: the right camera's own past" if comparison.stereo else ""
     mode = "" if later is None else f"; mode {later}"
     title = f"view {comparison.view}, mean over {count}{mode}{note}"
     table = Table(box=box.SIMPLE, title=title, title_justify="left", pad_edge=False)

@@ -191,14 +191,14 @@ def _check_number(name: str, shown: str, number: float) -> None:
         raise ValueError(f"{shown} {fault}, got {number}")
 
 
-def check_pixels(height: Any, width: Any) -> None:
+def check_pixels(height: Any, width: Any, name: str = "--height x --width") -> None:
     """Refuse a frame of more than `MOST_PIXELS`; a side that is not given is not checked.
 
     Raises:
         ValueError: too many pixels.
     """
     if isinstance(height, int) and isinstance(width, int) and height * width > MOST_PIXELS:
-        raise ValueError(f"--height x --width must be {MOST_PIXELS:,} px or less, got {height} x {width}")
+        raise ValueError(f"{name} must be {MOST_PIXELS:,} px or less, got {height} x {width}")
 
 
 def _numbers(value: Any) -> Iterator[float]:

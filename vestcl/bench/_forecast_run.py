@@ -32,6 +32,9 @@ from vestcl.views import parse_views
 
 _STREETS: Final = re.compile(r"street:(?:(\d{1,18})(?:-(\d{1,18}))?)?")
 
+#: Streets of one input: their frames are made in memory.
+MOST_STREETS: Final = 1000
+
 #: Options that choose windows or tables: a window's scores don't depend on them.
 _OF_TABLES: Final = ("inputs", "windows", "every", "first", "last", "horizons", "pool", "out", "markdown")
 
@@ -96,6 +99,8 @@ def clips_of(text: str, config: ForecastBench) -> list[Clip]:
         return [open_sequence(text)]
     first, last = streets[1], streets[2] or streets[1]
     seeds = HELD_OUT if first is None else range(int(first), int(last) + 1)
+    if len(seeds) > MOST_STREETS:
+        raise ValueError(f"`inputs` must have {MOST_STREETS:,} streets or fewer, got {text}")
     if not seeds:
         raise ValueError(f"`inputs` must have streets from a lower to a higher seed, got {text}")
     made = (Street.generate(seed) for seed in seeds)

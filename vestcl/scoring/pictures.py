@@ -1,7 +1,7 @@
 """Pictures beside the truth: what every method shows of a window's next frames, and how good it is."""
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from vestcl import baselines, metrics
-from vestcl.compare import FLOW, REPEAT
 from vestcl.data.resize import resize_image
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, View
@@ -22,6 +21,10 @@ from vestcl.views import seen_by
 
 #: The forecast without weights, as tables and files call it.
 GEOMETRIC: Final = "geometric"
+
+#: The baselines.
+REPEAT: Final = "repeat last"
+FLOW: Final = "optical flow"
 
 #: What baselines have in sight of where they are judged from another camera than their own.
 OTHER_CAMERA: Final = ", left camera"
@@ -219,7 +222,14 @@ def predictions(truth: Truth, index: int, steps: int, views: Sequence[View], for
 
 
 def score(
-    truth: Truth, index: int, views: Sequence[View], predictions: Predictions, forecast: Forecast, first: int = 1
+    truth: Truth,
+    index: int,
+    views: Sequence[View],
+    predictions: Predictions,
+    forecast: Forecast,
+    first: int = 1,
+    later: Sequence[int] | None = None,
+    report: Callable[[float], None] | None = None,
 ) -> list[Record]:
     """Every prediction of one window beside the truth, step by step.
 
@@ -230,6 +240,8 @@ def score(
         predictions: by view and method, a picture a step.
         forecast: its coverage tells which pixels the source camera has seen ("psnr_seen").
         first: the step that ``forecast`` begins with, 0 for the current frame itself.
+        later: the true frame of each step; None takes one after the other from ``index + first`` on.
+        report: is given the share of the steps that are done, 0 to 1.
 
     Returns:
         A record a view and method.
@@ -242,12 +254,15 @@ def score(
         for view in views:
             looks = [known[id(picture)] for picture in shown[view.name].values()]
             coverage = resize_image(forecast.frames[step][view.name].coverage, *truth.size)
-            wanted, seen = truth.look(view, index + first + step), torch.from_numpy(coverage >= SEEN)[None]
+            at = index + first + step if later is None else later[step]
+            wanted, seen = truth.look(view, at), torch.from_numpy(coverage >= SEEN)[None]
             of_view = _scores(looks, wanted, seen, truth)
             for row, method in enumerate(shown[view.name]):
                 of_method = scores.setdefault((view.name, method), {name: [] for name in of_view})
                 for name, values in of_view.items():
                     of_method[name].append(float(values[row]))
+        if report is not None:
+            report((step + 1) / len(forecast.frames))
     where = truth.clip.name, truth.clip[index].name, index
     seconds = {(view, name): each.seconds for view, of in predictions.items() for name, each in of.items()}
     return [Record(*where, *key, seconds[key], of, first) for key, of in scores.items()]
