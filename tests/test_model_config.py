@@ -18,7 +18,14 @@ from vestcl.models import (
     RigidMotion,
     configuration,
 )
-from vestcl.models.config import EgoMotionConfig, ObjectMotionConfig, RefineConfig, RenderConfig, RoutingConfig
+from vestcl.models.config import (
+    EgoMotionConfig,
+    EncoderConfig,
+    ObjectMotionConfig,
+    RefineConfig,
+    RenderConfig,
+    RoutingConfig,
+)
 
 
 def test_names() -> None:
@@ -37,6 +44,15 @@ def test_the_paper() -> None:
     assert not config.render.joint and config.refine.base == "none"
     assert config.start == "rest" and config.default_mode == "feedback" and not config.object_motion.inpainted
     assert configuration("vest-paper+colour").render.channels(32) == 74
+    assert config.encoder == EncoderConfig((64, 128, 256), (3, 4, 6), (128, 64), features=32, background="own")
+    assert config.ego_motion == EgoMotionConfig((64, 64, 128, 128), blocks=2, heads=4, mlp_ratio=4, path=1)
+    objects = config.object_motion
+    assert objects.scales == (4, 4, 4, 2, 2, 2, 1, 1, 1) and objects.widths == (160,) * 3 + (80,) * 3 + (44,) * 3
+    assert objects.detail == 8 and objects.where == "everywhere"
+    assert config.render == RenderConfig(
+        colour=False, joint=False, rho=1.5, stretched=False, inpainted="own", previous="all", normalised=False
+    )
+    assert config.refine == RefineConfig(stem=32, stem_kernel=7, widths=(64, 128, 256, 512), base="none")
 
 
 def test_every_variant_changes_its_own_field() -> None:

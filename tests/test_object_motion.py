@@ -65,6 +65,29 @@ def test_number_of_parameters(name: str, count: int) -> None:
     assert sum(parameter.numel() for parameter in network.parameters()) == count
 
 
+@pytest.mark.parametrize(("name", "giga"), [("vest-paper", 141.1), ("vest-paper+omf-dmvfn", 15.1)])
+def test_multiply_adds_of_the_published_shapes(name: str, giga: float) -> None:
+    """At 256 x 832: a weight counts once per pixel that a conv gives, or that a transposed conv takes.
+
+    The device "meta" has shapes and computes nothing.
+    """
+    counted = []
+
+    def count(module: nn.Module, inputs: tuple[torch.Tensor, ...], output: torch.Tensor) -> None:
+        weight = module.weight
+        assert isinstance(weight, torch.Tensor)
+        grid = inputs[0] if isinstance(module, nn.ConvTranspose2d) else output
+        counted.append(weight.numel() * grid.shape[2] * grid.shape[3])
+
+    with torch.device("meta"):
+        network, arguments = ObjectMotion(configuration(name).object_motion), scene(1, 256, 832, 32)
+        for module in network.modules():
+            if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+                module.register_forward_hook(count)
+        network.eval()(**arguments)
+    assert sum(counted) / 1e9 == pytest.approx(giga, abs=0.05)
+
+
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("name", ["vest-paper", "vest-s", "vest-s+omf-paper", "vest-s+routing"])
 def test_named_models_start_at_the_rigid_flow(name: str, training: bool) -> None:

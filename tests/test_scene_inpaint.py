@@ -88,6 +88,23 @@ def test_the_rim_is_not_taken_for_background() -> None:
     assert clean.max() < 0.5 and ghost.mean() > clean.mean() + 0.1
 
 
+@pytest.mark.parametrize(("width", "radius"), [(832, 10), (1024, 12), (416, 5)])
+def test_holes_are_dilated_by_ten_pixels_at_832_columns(width: int, radius: int) -> None:
+    """And in proportion at other widths."""
+    mask, seen = np.ones((1, 64, width), bool), []
+    mask[0, 30:34, 100:104] = False
+
+    def fill(image: np.ndarray, hole: np.ndarray, road: np.ndarray) -> np.ndarray:
+        seen.append(hole[0])
+        return image
+
+    inpaint_background(np.zeros((3, 64, width), np.float32), np.full((1, 64, width), 9, np.float32), mask, method=fill)
+    rows, columns = seen[0].nonzero()
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (
+        30 - radius, 33 + radius, 100 - radius, 103 + radius,
+    )  # fmt: skip
+
+
 def test_the_sky_stays_the_sky() -> None:
     image, depth, mask, *_ = room()
     depth = np.where(np.arange(HEIGHT)[None, :, None] < 20, np.float32(10_000), depth)

@@ -262,6 +262,12 @@ def test_the_papers_settings(path: Path) -> None:
     assert stages == (["ego", "all"] if path.stem.endswith("two-stages") else ["all"])
     windows = {"street": 400, "kitti": 6894, "kitti-views": 5949, "cityscapes": 2975}[path.stem.split("_")[1]]
     assert config.steps == 300 * windows // 4
+    assert config.data.horizons == (1.0,) and not config.data.right and config.run.precision == "float32"
+    assert not any(stage.warm_up for stage in config.stages) and all(stage.render for stage in config.stages)
+    adam = config.optimiser
+    assert adam.betas == (0.9, 0.999) and adam.clip_norm is None and not any(
+        (adam.weight_decay, adam.ema, adam.final_factor)
+    )  # fmt: skip
 
 
 def test_the_encoders_public_weights_are_a_key() -> None:

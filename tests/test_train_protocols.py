@@ -164,3 +164,39 @@ def test_the_papers_rows_are_of_what_is_measured() -> None:
             assert row.view in views and row.metric in METRICS
             assert set(row.values) == ({0} if row.view == NOW else set(protocol.shown))
             assert all(0 < value < 1 for value in row.values.values())
+
+
+def test_the_papers_sizes_horizons_and_figures() -> None:
+    """All of its tables, x 10^-2, by protocol, row and metric."""
+    kitti, cityscapes = ((256, 832), 5, (1, 3, 5), 3), ((512, 1024), 10, (1, 5, 10), None)
+    settings = {name: (p.size, p.steps, p.shown, p.first) for name, p in PROTOCOLS.items() if p.paper}
+    assert settings == {
+        "kitti-prediction": kitti, "kitti-space-time": kitti, "kitti-space": kitti, "cityscapes-prediction": cityscapes,
+    }  # fmt: skip
+    views = {name: p.views for name, p in PROTOCOLS.items() if p.paper}
+    assert views.pop("kitti-space-time") == ("right",) and set(views.values()) == {("source",)}
+    figures = {
+        "kitti-prediction": [("the paper", "87.7 77.6 71.3", "10.1 15.4 19.8")],
+        "kitti-space-time": [
+            ("the paper", "86.2 76.1 69.3", "12.3 17.1 21.4"),
+            ("the paper, A: fixed depth", "83.2 73.1 66.4", "15.1 20.2 25.8"),
+            ("the paper, B: without EMF", "85.6 75.5 68.4", "12.9 18.1 22.4"),
+            ("the paper, C: without OMF", "84.6 74.8 67.9", "13.5 19.1 24.3"),
+        ],
+        "kitti-space": [("the paper, space", "94.6", "5.2"), ("the paper, time", "", "8.1 18.6 20.4")],
+        "cityscapes-prediction": [("the paper", "96.4 86.2 78.0", "4.6 9.8 14.9")],
+    }
+    for name, rows in figures.items():
+        wanted = {
+            (method, metric): numbers
+            for method, *both in rows
+            for metric, numbers in zip(("ssim", "lpips"), both, strict=True)
+            if numbers
+        }
+        found = {
+            (row.method, row.metric.removeprefix("ms_")): " ".join(
+                f"{100 * value:.1f}" for value in row.values.values()
+            )
+            for row in PROTOCOLS[name].paper  # type: ignore[index]
+        }
+        assert found == wanted
