@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models import configuration
+from vestcl.models import _render, configuration
 from vestcl.models._clouds import Cloud
 from vestcl.models._render import splat_cloud
 from vestcl.models.config import LEAST_COVERAGE, RenderConfig
@@ -104,6 +104,28 @@ def test_motion_learns_from_the_splatted_colour() -> None:
     functional.mse_loss(inner, smooth[..., 4:-4]).backward()
     grad = model.ego_motion.motion.bias.grad
     assert grad is not None and grad[7 + 4] > 1e-4  # too far to the right
+
+
+def test_the_radius_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """rho z_src / z_tgt px times the ratio of focal lengths, not below half a pixel and not above half a tile."""
+    z = torch.tensor([10.0, 5.0, 0.5, 100.0])
+    one, none, starts = torch.ones(4, 1), torch.zeros(4, dtype=torch.bool), torch.tensor([0, 4])
+    points, moved = torch.tensor([[0.0, 0, 10]]).repeat(4, 1), torch.stack([0 * z, 0 * z, z - 10], dim=1)
+    cloud = Cloud(points, moved, 0 * moved, points[:, 2], one, one.expand(4, 3), one, none, (), starts)
+    seen: list[torch.Tensor] = []
+
+    def rasterize(points_uv, z, radii, *others, **named):  # type: ignore[no-untyped-def]
+        seen.append(radii)
+        return original(points_uv, z, radii, *others, **named)
+
+    original = _render.rasterize
+    monkeypatch.setattr(_render, "rasterize", rasterize)
+    still, K = torch.eye(4)[None], camera(1, 9, 9)
+    for zoom in (1.0, 2.0):
+        target = K * torch.tensor([zoom, zoom, 1.0])[:, None]
+        splat_cloud(cloud, Camera(still, target), K, still, RenderConfig(), 9, 9)
+    assert torch.allclose(seen[0], torch.tensor([1.5, 3, 8, 0.5]))
+    assert torch.allclose(seen[1], torch.tensor([3.0, 6, 8, 0.5]))
 
 
 def test_the_radius_has_a_gradient() -> None:
