@@ -1,16 +1,21 @@
-"""vestcl.scene.motion.backtest: candidate velocities weighted by how they would have forecast the last frame."""
+"""vestcl.scene.motion.backtest: candidate motions weighted by how they would have forecast the last frame."""
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vestcl.scene.motion.backtest import Frame, backtest, mixed, residual_velocity
+from vestcl.scene.motion.backtest import Frame, backtest, candidates, mixed, residual_flow
 
 HEIGHT, WIDTH, FOCAL, DEPTH = 64, 160, 100.0, 10.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+STILL = np.eye(4)
+CENTRES = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5))
 
 Image = NDArray[np.float32]
+
+#: Indices of the candidates.
+OBJECT, REST, FLOW, PLACE, LINEAR = range(5)
 
 
 def texture() -> Image:
@@ -19,7 +24,7 @@ def texture() -> Image:
     return cv2.GaussianBlur(noise, (0, 0), 2).transpose(2, 0, 1) * 3 % 1
 
 
-def frames(left: float, right: float) -> tuple[Frame, Frame]:
+def frames(left: float, right: float, elapsed: float = 1.0) -> tuple[Frame, Frame]:
     """Two frames of a wall whose left and right half move by ``left`` and ``right`` px; the camera does not."""
     wide = texture()
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
@@ -30,52 +35,102 @@ def frames(left: float, right: float) -> tuple[Frame, Frame]:
         return np.stack([cv2.remap(plane, at, y, cv2.INTER_LINEAR) for plane in wide])
 
     flow_uv = np.stack([-shift, np.zeros_like(shift)])
-    depth = np.full((1, HEIGHT, WIDTH), DEPTH, np.float32)
-    before, after = (Frame(shown(time), depth, flow_uv, np.eye(4), K) for time in (0, 1))
+    depth, still = np.full((1, HEIGHT, WIDTH), DEPTH, np.float32), np.zeros((3, HEIGHT, WIDTH), np.float32)
+    before, after = (Frame(shown(time), depth, still, flow_uv, np.eye(4), K, elapsed) for time in (0, 1))
     return before, after
 
 
-def test_what_flow_shows_is_a_velocity_at_constant_depth() -> None:
-    velocity = residual_velocity(frames(2.0, 0.0)[1])
-    np.testing.assert_allclose(velocity[0, :, 10:70], 2.0 * DEPTH / FOCAL, atol=1e-6)
-    np.testing.assert_allclose(velocity[:, :, 90:], 0, atol=1e-6)
+def test_what_flow_shows_beyond_the_cameras_motion() -> None:
+    residual = residual_flow(frames(2.0, 0.0)[1])
+    np.testing.assert_allclose(residual[0, :, 10:70], 2.0, atol=1e-5)
+    np.testing.assert_allclose(residual[:, :, 90:], 0, atol=1e-5)
 
 
-def test_the_cameras_own_motion_is_no_velocity() -> None:
+def test_the_cameras_own_motion_is_no_residual() -> None:
     moved = np.eye(4)
     moved[0, 3] = 0.2  # prev_from_cur: points were 0.2 m further right, 2 px
     frame = frames(-2.0, -2.0)[1]._replace(prev_from_cur=moved)
-    np.testing.assert_allclose(residual_velocity(frame), 0, atol=1e-5)
+    np.testing.assert_allclose(residual_flow(frame), 0, atol=1e-4)
 
 
-@pytest.mark.parametrize("far", [10_000.0])
-def test_the_sky_has_no_velocity(far: float) -> None:
+def test_a_wrong_match_is_no_motion() -> None:
+    assert not residual_flow(frames(50.0, 50.0)[1]).any()
+
+
+def test_residual_flow_is_per_interval() -> None:
+    np.testing.assert_allclose(residual_flow(frames(3.0, 3.0, elapsed=2.0)[1])[0], 1.5, atol=1e-5)
+
+
+def test_candidates_by_hand() -> None:
+    """Flow of 2 px an interval to the right, an object of 0.5 m an interval, the camera 1 m ahead: 10 m become 8."""
     frame = frames(2.0, 2.0)[1]
-    assert not residual_velocity(frame._replace(depth=np.full_like(frame.depth, far))).any()
+    frame = frame._replace(velocity=np.full_like(frame.velocity, 0) + np.float32([0.5, 0, 0])[:, None, None])
+    ahead = np.eye(4)
+    ahead[2, 3] = -2.0
+    positions, depth = candidates(frame, ahead, 2.0)
+    assert len(positions) == 4
+    np.testing.assert_allclose(depth, 8.0, atol=1e-5)
+    middle = np.array([WIDTH / 2, HEIGHT / 2])[:, None, None]
+    rest = middle + (CENTRES - middle) * DEPTH / 8
+    np.testing.assert_allclose(positions[REST], rest, atol=1e-3)
+    np.testing.assert_allclose(positions[OBJECT][0], rest[0] + FOCAL * 1.0 / 8, atol=1e-3)
+    np.testing.assert_allclose(positions[FLOW][0], rest[0] + 4.0, atol=1e-3)
+    np.testing.assert_allclose(positions[PLACE], positions[FLOW], atol=1e-3)
+
+
+def test_flow_itself_is_a_candidate_where_depth_is_from_motion() -> None:
+    frame = frames(2.0, 2.0, elapsed=2.0)[1]._replace(monocular=True)
+    positions, _ = candidates(frame, STILL, 3.0)
+    np.testing.assert_allclose(positions[LINEAR][0], CENTRES[0] + 3.0, atol=1e-4)
+    np.testing.assert_allclose(positions[LINEAR][1], CENTRES[1], atol=1e-4)
+
+
+@pytest.mark.parametrize("ahead", [1.0, 2.0, 2.5])
+def test_at_a_place_motion_ends_where_the_flow_does(ahead: float) -> None:
+    """The left half moves by 8 px an interval, and what crosses to the right half stops there."""
+    positions, _ = candidates(frames(8.0, 0.0)[1], STILL, ahead)
+    far = positions[PLACE][0, :, :40]
+    np.testing.assert_allclose(far, CENTRES[0, :, :40] + 8 * ahead, atol=1e-3)
+    assert (positions[PLACE][0, :, :80] < WIDTH / 2 + 8).all() and positions[FLOW][0, :, 79].min() > WIDTH / 2 + 7
+
+
+def errors_of(before: Frame, after: Frame, positions: Image) -> Image:
+    return backtest(positions, before, after.image, [after.flow_uv])
 
 
 def test_each_region_follows_the_candidate_that_was_right_there() -> None:
     before, after = frames(3.0, 0.0)
-    moving, still = np.zeros((2, 3, HEIGHT, WIDTH), np.float32)
-    moving[0] = 3.0 * DEPTH / FOCAL
-    candidates = np.stack([moving, still])
-    errors = backtest(candidates, before, after)
+    moving = CENTRES + np.array([3.0, 0])[:, None, None]
+    positions = np.stack([moving, CENTRES]).astype(np.float32)
+    errors = errors_of(before, after, positions)
     assert (errors[0, :, 10:60] < 0.2 * errors[1, :, 10:60]).all()
     assert (errors[1, :, 100:150] < 0.2 * errors[0, :, 100:150]).all()
-    velocity = mixed(candidates, errors)
-    np.testing.assert_allclose(velocity[0, :, 10:60], 0.3, atol=0.01)
-    np.testing.assert_allclose(velocity[0, :, 100:150], 0, atol=0.01)
+    found = mixed(positions, errors) - CENTRES
+    np.testing.assert_allclose(found[0, :, 10:60], 3.0, atol=0.1)
+    np.testing.assert_allclose(found[0, :, 100:150], 0, atol=0.1)
+
+
+def test_errors_of_two_frames_are_brought_along_both_flows() -> None:
+    """Something wrong at columns 40 to 60 of t - 2 is at 46 to 66 of t when all moves by 3 px."""
+    before, after = frames(3.0, 3.0)
+    changed = after.image.copy()
+    spoilt = before._replace(image=np.where((CENTRES[0] > 40) & (CENTRES[0] < 60), 0, before.image).astype(np.float32))
+    moved = (CENTRES + np.array([3.0, 0])[:, None, None])[None].astype(np.float32)
+    once = backtest(moved, spoilt, changed, [after.flow_uv])[0]
+    twice = backtest(moved, spoilt, changed, [after.flow_uv, after.flow_uv])[0]
+    x = CENTRES[0, :, 20:120]
+    centre = [float((each[:, 20:120] * x).sum() / each[:, 20:120].sum()) for each in (once, twice)]
+    assert centre[1] - centre[0] == pytest.approx(3.0, abs=0.4)
 
 
 def test_candidates_that_err_alike_are_averaged() -> None:
-    candidates = np.stack([np.full((3, 4, 4), value, np.float32) for value in (1.0, 3.0)])
-    np.testing.assert_allclose(mixed(candidates, np.ones((2, 4, 4), np.float32)), 2.0, atol=1e-6)
+    positions = np.stack([np.full((2, 4, 4), value, np.float32) for value in (1.0, 3.0)])
+    np.testing.assert_allclose(mixed(positions, np.ones((2, 4, 4), np.float32)), 2.0, atol=1e-6)
 
 
 def test_outside_of_the_image_nothing_is_decided() -> None:
     before, after = frames(0.0, 0.0)
-    away = np.zeros((3, HEIGHT, WIDTH), np.float32)
-    away[0] = 100.0
-    errors = backtest(np.stack([away, 2 * away]), before, after)
+    away = CENTRES + np.array([500.0, 0])[:, None, None]
+    errors = errors_of(before, after, np.stack([away, away + 500]).astype(np.float32))
     np.testing.assert_allclose(errors[0], errors[1])
     assert np.isfinite(errors).all() and (errors > 0).all()

@@ -1,4 +1,4 @@
-"""Future frames from new views: the camera by its forecast motion, each point by the velocity that proved best.
+"""Future frames from new views: the camera by its forecast motion, each point by what proved best for it.
 
 Velocities are per interval of the clip (`Clip.interval`), whatever the time between the frames they are measured in.
 """
@@ -12,17 +12,10 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
+from vestcl.geometric.paths import Paths, forecast_cameras, point_paths
 from vestcl.geometric.perception import Perception
 from vestcl.geometric.render import Cloud, Shown, holes, rendered, show
 from vestcl.scene.holes import deep_holes, fill_holes
-from vestcl.scene.motion.camera_forecast import forecast_camera
-
-#: The camera is forecast from so many last motions. On KITTI odometry 00 four have 0.66 of constant velocity's error of
-#: rotation at t+1 and 0.77 of that of translation, all that were before 0.65 and 0.72; each takes a flow and a depth.
-_MOTIONS: Final = 4
-
-#: Seconds between frames of a clip without times: KITTI's.
-_INTERVAL: Final = 0.1
 
 #: The name of this method in tables and files.
 METHOD: Final = "geometric"
@@ -90,12 +83,13 @@ def forecast_frames(
         raise ValueError(f"`index` must be 1 ... {len(clip) - 1}, a frame of {clip.name} with one before, got {index}")
     if steps < 1 or not views:
         raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
-    cameras = _extrapolate(perception, index, steps) if future_from_cur is None else list(future_from_cur)
+    ahead = range(1, steps + 1)
+    cameras = forecast_cameras(perception, index, ahead) if future_from_cur is None else list(future_from_cur)
     if len(cameras) < steps:
         raise ValueError(f"`future_from_cur` must be of {steps} steps or more, got {len(cameras)}")
     clouds = _clouds(perception, index)
     start, frames = time.perf_counter(), list[dict[str, Rendered]]()
-    for step in range(1, steps + 1):
+    for step in ahead:
         moved = [cloud(step, [np.eye(4), *cameras]) for cloud in clouds]
         frames.append({})
         for view in views:
@@ -134,15 +128,6 @@ def show_frame(perception: Perception, index: int, views: Sequence[View]) -> dic
     return {view.name: _render(clouds, clip[index].K if view.K is None else view.K, view, clip) for view in views}
 
 
-def _extrapolate(perception: Perception, index: int, steps: int) -> list[NDArray[np.float64]]:
-    """future_from_cur for each step, which is an interval of the clip."""
-    clip, seen = perception.clip, range(max(index - _MOTIONS + 1, 1), index + 1)
-    motions = [np.linalg.inv(perception.prev_from_cur(i)) for i in seen]
-    interval = clip.interval or _INTERVAL
-    ahead = [step * interval for step in range(1, steps + 1)]
-    return forecast_camera(motions, [clip.elapsed(i) * interval for i in seen], ahead)
-
-
 MovingCloud = Callable[[int, list[NDArray[np.float64]]], Cloud]
 """A cloud at a step, given ``future_from_cur`` of all steps from 0."""
 
@@ -152,13 +137,31 @@ def _clouds(perception: Perception, index: int) -> list[MovingCloud]:
     K = perception.clip[index].K
     cur, prev = perception.seen(index), perception.seen(index - 1)
     cur_from_prev = np.asarray(np.linalg.inv(perception.prev_from_cur(index)), np.float64)
-    everything = np.ones_like(cur.layers.mask)
-    shown = _cloud(cur.layers.image, cur.layers.depth, everything, K, perception.velocity(index), cur.own)
+    shown = _shown(point_paths(perception, index), cur.own)
     since = cur_from_prev, perception.clip.elapsed(index)
-    before = _cloud(prev.layers.image, prev.layers.depth, ~prev.own, K, prev.velocity, None, *since)
+    before = _cloud(prev.layers.image, prev.layers.depth, ~prev.own, K, prev.velocity, *since)
     hidden = ~cur.layers.mask & ~cur.own
     behind = _cloud(cur.layers.background_image, cur.layers.background_depth, hidden, K)
     return [shown, before, behind]
+
+
+def _shown(paths: Paths, own: NDArray[np.bool_]) -> MovingCloud:
+    """All pixels of the current frame; those of the recording car, ``own`` [1, H, W], stay in its camera's axes."""
+    frame, (rows, columns) = paths.frame, np.indices(own.shape[1:]).reshape(2, -1)
+    z_src = frame.depth.reshape(-1).astype(np.float32)
+    points = dict[int, NDArray[np.float32]]()
+
+    def points_at(step: int, future_from_cur: list[NDArray[np.float64]]) -> NDArray[np.float32]:
+        if step not in points:
+            moved = np.where(own, paths.at(0, np.eye(4)), paths.at(step, future_from_cur[step]))
+            points[step] = np.ascontiguousarray(moved.reshape(3, -1).T, np.float32)
+        return points[step]
+
+    def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
+        there, before = (points_at(k, future_from_cur) for k in (step, step - 1))
+        return Cloud(there, z_src, frame.image, there - before, rows, columns)
+
+    return at
 
 
 def _cloud(
@@ -167,11 +170,10 @@ def _cloud(
     which: NDArray[np.bool_],
     K: NDArray[np.float64],
     velocity: NDArray[np.float32] | None = None,
-    own: NDArray[np.bool_] | None = None,
     cur_from_src: NDArray[np.float64] | None = None,
     elapsed: float = 0.0,
 ) -> MovingCloud:
-    """The pixels of ``which`` [1, H, W] as points of the current camera; those of the recording car ride along.
+    """The pixels of ``which`` [1, H, W] as points of the current camera, at constant velocity.
 
     ``elapsed`` intervals have gone by since the frame, whose camera ``cur_from_src`` brings to the current one.
     """
@@ -183,14 +185,10 @@ def _cloud(
         points = _transform(cur_from_src, points + elapsed * speed)
         speed = speed @ cur_from_src[:3, :3].T
     z_src = z.astype(np.float32)
-    rides = np.zeros((len(x), 1), bool) if own is None else own[0, y, x][:, None]
 
     def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
-        there, before = (
-            np.where(rides, points, _transform(future_from_cur[k], points + k * speed)) for k in (step, step - 1)
-        )
-        step_xyz = (there - before).astype(np.float32)
-        return Cloud(there.astype(np.float32), z_src, image, step_xyz, y, x)
+        there, before = (_transform(future_from_cur[k], points + k * speed) for k in (step, step - 1))
+        return Cloud(there.astype(np.float32), z_src, image, (there - before).astype(np.float32), y, x)
 
     return at
 

@@ -115,13 +115,14 @@ class Perception:
         """The frame's layers and things."""
         return self._once("layers", index, lambda: self._see(index))
 
-    def velocity(self, index: int) -> NDArray[np.float32]:
-        """[3, H, W] m an interval, of each pixel's point at frame ``index`` in the world: what its object does, or what
-        flow shows, or rest, as each of them would have forecast this frame from the one before.
-
-        Without two frames before, it is that of `seen`.
-        """
-        return self._once("backtest", index, lambda: self._backtested(index))
+    def frame(self, index: int) -> backtest.Frame:
+        """The frame as candidate motions of its points are made and tested; at frame 0 nothing came from anywhere."""
+        seen, K, image = self.seen(index), self.clip[index].K, self.image(index)
+        asked = image, seen.layers.depth, seen.velocity
+        if index == 0:
+            return backtest.Frame(*asked, np.zeros_like(image[:2]), np.eye(4), K)
+        motion = self.correspondence(index).flow_uv, self.prev_from_cur(index)
+        return backtest.Frame(*asked, *motion, K, self.clip.elapsed(index), self._is_monocular(index))
 
     def inverse_std(self, index: int) -> float:
         """Standard deviation of 1 / depth, 1/m."""
@@ -251,23 +252,3 @@ class Perception:
             velocity = confirmed(by_flow, velocity, layers.depth, pair)
             velocity /= np.float32(self.clip.elapsed(index))
         return Seen(layers, things, velocity, own)
-
-    def _backtested(self, index: int) -> NDArray[np.float32]:
-        now = self._candidates(index)
-        if index < 2 or self.is_lost(index) or self.is_lost(index - 1):
-            return now[0]
-        before = self._candidates(index - 1) * np.float32(self.clip.elapsed(index))
-        return backtest.mixed(now, backtest.backtest(before, self._frame(index - 1), self._frame(index)))
-
-    def _candidates(self, index: int) -> NDArray[np.float32]:
-        """[3, 3, H, W] m an interval: the object's velocity, what flow shows beyond the camera's motion, and rest."""
-        velocity = self.seen(index).velocity
-        if index == 0:
-            return np.stack([velocity] * 3)
-        by_flow = backtest.residual_velocity(self._frame(index)) / np.float32(self.clip.elapsed(index))
-        return np.stack([velocity, by_flow, np.zeros_like(velocity)])
-
-    def _frame(self, index: int) -> backtest.Frame:
-        flow_uv = self.correspondence(index).flow_uv
-        layers, K = self.seen(index).layers, self.clip[index].K
-        return backtest.Frame(self.image(index), layers.depth, flow_uv, self.prev_from_cur(index), K)

@@ -1,10 +1,12 @@
 """Candidate motions of each pixel's point, weighted by how well they would have forecast the frame already seen.
 
-A candidate c gives every pixel of t - 1 a velocity v_c. With the camera's measured motion it forecasts where the
-pixel's point is at t: e_c = |I_(t-1)(p) - I_t(project(K (R (x + v_c) + t)))|^2, smoothed. The velocity that it has for
-t is trusted as far as the one before was right: w_c = e_c^-g / sum e^-g.
+A candidate c says where a pixel p of frame t - h is in the image k intervals on, q_c(p, k). Those of t - h forecast
+frame t from what was known at t - h, the camera's motion included: e_c = |I_(t-h)(p) - I_t(q_c(p, h))|^2, smoothed.
+The candidates of t are trusted as far as those before were right: q = sum_c w_c q_c, w_c = e_c^-g / sum e^-g.
 """
 
+import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import cv2
@@ -12,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.scene.correspondence import sample
-from vestcl.scene.layers import SKY_DEPTH
 from vestcl.scene.motion_plane import rays_of
-from vestcl.scene.parallax import moved_pixels
+from vestcl.scene.parallax import moved_pixels, pixel_centres
 
 Array = NDArray[np.float32]
 
@@ -28,8 +29,11 @@ _MOST, _NOISE = 0.05, 1e-5
 #: along the flow, so that it need not be exact, and then.
 _WIDTH, _BEFORE, _AFTER = 832, 2.0, 8.0
 
-#: Flow that leaves the rigid motion by more pixels than that is a wrong match.
+#: Flow that leaves the rigid motion by more pixels an interval than that is a wrong match.
 _LARGEST: Final = 40.0
+
+#: Metres; nearer points are not divided by their depth.
+_NEAREST: Final = 0.1
 
 
 class Frame(NamedTuple):
@@ -39,68 +43,110 @@ class Frame(NamedTuple):
     """[3, H, W] RGB in [0, 1]."""
     depth: Array
     """[1, H, W] m, above 0."""
+    velocity: Array
+    """[3, H, W] m an interval of the clip, of the object that a pixel shows."""
     flow_uv: Array
     """[2, H, W] px, to the frame before."""
     prev_from_cur: NDArray[np.float64]
     """[4, 4] m, the camera's motion."""
     K: NDArray[np.float64]
     """[3, 3] px."""
+    elapsed: float = 1.0
+    """Intervals since the frame before."""
+    monocular: bool = False
+    """Whether depth comes from motion: it may then be far off, and so what is computed from it."""
 
 
-def residual_velocity(frame: Frame) -> Array:
-    """v [3, H, W] m over the interval before the frame: what flow shows beyond the camera's motion, at constant depth.
+def residual_flow(frame: Frame) -> Array:
+    """r [2, H, W] px an interval, forward: what flow shows beyond the camera's motion, (p' - (p + flow)) / elapsed.
 
-    v = -z' K^-1 (p + flow(p) - project(K (R x + t)), 0), with z' the depth in the frame before; 0 in the sky, and where
-    the difference is no motion but a wrong match.
+    p' is where the point would have been in the frame before at rest. 0 where the difference is no motion but a wrong
+    match.
     """
-    q = _moved(frame, frame.prev_from_cur, np.zeros((3, 1, 1), np.float32))
-    residual = moved_pixels(frame.flow_uv) - q[:2]
-    believed = (frame.depth[0] < SKY_DEPTH) & (q[2] > 0.1) & (np.hypot(*residual) < _LARGEST)
-    focal = np.array([frame.K[0, 0], frame.K[1, 1]])[:, None, None]
-    velocity = np.zeros_like(frame.image)
-    velocity[:2] = -np.where(believed, residual * q[2] / focal, 0)
-    return velocity
+    q, z = _project(frame, frame.prev_from_cur, np.zeros((3, 1, 1), np.float32))
+    residual = (q - moved_pixels(frame.flow_uv)) / frame.elapsed
+    believed = (z > _NEAREST) & (np.hypot(*residual) < _LARGEST)
+    return np.where(believed, residual, 0).astype(np.float32)
 
 
-def backtest(candidates: Array, before: Frame, after: Frame) -> Array:
+def candidates(frame: Frame, future_from_cur: NDArray[np.float64], ahead: float) -> tuple[Array, Array]:
+    """Where each pixel's point may be after ``ahead`` intervals.
+
+    The candidates: its object's velocity; rest in the world; rest and ``ahead`` times the residual flow r; rest and r
+    followed from place to place, as objects that come to the end of where r was seen slow down in the mean. Where
+    depth is from motion also flow itself, p - ahead flow / elapsed, which knows of no depth.
+
+    Args:
+        frame: that is looked at.
+        future_from_cur: [4, 4] m, the camera's forecast motion over that time.
+        ahead: intervals of the clip, above 0.
+
+    Returns:
+        [C, 2, H, W] px, and [H, W] m, the depth there by the first candidate.
+    """
+    by_object, z = _project(frame, future_from_cur, ahead * frame.velocity)
+    rest, _ = _project(frame, future_from_cur, np.zeros((3, 1, 1), np.float32))
+    residual = residual_flow(frame)
+    found = [by_object, rest, rest + ahead * residual, rest + _followed(residual, ahead)]
+    if frame.monocular:
+        found.append(pixel_centres(*frame.depth.shape[1:]) - frame.flow_uv * (ahead / frame.elapsed))
+    return np.stack(found).astype(np.float32), np.maximum(z, _NEAREST).astype(np.float32)
+
+
+def backtest(positions: Array, before: Frame, after: Array, flows: Sequence[Array]) -> Array:
     """Errors e_c at t of candidates that knew nothing of t.
 
     Args:
-        candidates: [C, 3, H, W] m over the interval from t - 1 to t, of the pixels of t - 1.
-        before: t - 1.
-        after: t.
+        positions: [C, 2, H, W] px, where the pixels of an earlier frame were forecast to be at t.
+        before: that frame.
+        after: [3, H, W], the image at t.
+        flows: [2, H, W] px each, from t to the frame before and so on until the earlier frame.
 
     Returns:
         [C, H, W], above 0.
     """
-    cur_from_prev = np.asarray(np.linalg.inv(after.prev_from_cur), np.float64)
-    height, width = after.image.shape[1:]
-    y, x = np.mgrid[:height, :width].astype(np.float32)
-    back = x + after.flow_uv[0], y + after.flow_uv[1]
+    x, y = np.asarray(pixel_centres(*after.shape[1:]) - 0.5, np.float32)
+    for flow_uv in flows:
+        along = sample(flow_uv, x, y, outside=0.0)
+        x, y = x + along[0], y + along[1]
     errors = []
-    for velocity in candidates:
-        u, v, z = _moved(before, cur_from_prev, velocity)
-        found = sample(after.image, u - 0.5, v - 0.5, outside=np.nan)
-        error = np.where(z > 0.1, np.square(found - before.image).mean(0), np.nan)
-        error = np.minimum(np.nan_to_num(error, nan=_MOST), np.float32(_MOST)).astype(np.float32)
-        brought = cv2.remap(_smooth(error, _BEFORE), *back, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    for u, v in positions:
+        found = sample(after, u - 0.5, v - 0.5, outside=np.nan)
+        error = np.nan_to_num(np.square(found - before.image).mean(0), nan=_MOST)
+        smooth = _smooth(np.minimum(error, np.float32(_MOST)), _BEFORE)
+        brought = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         errors.append(_smooth(np.asarray(brought, np.float32), _AFTER) + np.float32(_NOISE))
     return np.stack(errors)
 
 
-def mixed(candidates: Array, errors: Array) -> Array:
-    """sum_c w_c v_c [3, H, W] of ``candidates`` [C, 3, H, W], by their ``errors`` [C, H, W]."""
+def mixed(positions: Array, errors: Array) -> Array:
+    """sum_c w_c q_c [2, H, W] of ``positions`` [C, 2, H, W], by their ``errors`` [C, H, W]."""
     weights = (errors / errors.min(axis=0)) ** -_SHARPNESS
     weights /= weights.sum(axis=0)
-    return np.asarray((weights[:, None] * candidates).sum(axis=0), np.float32)
+    return np.asarray((weights[:, None] * positions).sum(axis=0), np.float32)
 
 
-def _moved(frame: Frame, dst_from_src: NDArray[np.float64], velocity: Array) -> NDArray[np.float64]:
-    """[3, H, W]: u, v px and z m in another camera of what the frame's pixels show, moved by ``velocity`` before."""
+def _project(
+    frame: Frame, dst_from_src: NDArray[np.float64], shift: Array
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """[2, H, W] px and [H, W] m in another camera of what the pixels show, moved by ``shift`` [3, H, W] before."""
     height, width = frame.depth.shape[1:]
-    points = (rays_of(frame.K, height, width) * frame.depth + velocity).reshape(3, -1)
+    points = (rays_of(frame.K, height, width) * frame.depth + shift).reshape(3, -1)
     q = frame.K @ (dst_from_src[:3, :3] @ points + dst_from_src[:3, 3:])
-    return np.stack([*(q[:2] / np.maximum(q[2], 0.1)), q[2]]).reshape(3, height, width)
+    uv = q[:2] / np.maximum(q[2], _NEAREST)
+    return uv.reshape(2, height, width), q[2].reshape(height, width)
+
+
+def _followed(residual: Array, ahead: float) -> Array:
+    """[2, H, W] px: the way along ``residual`` px an interval, looked up anew after each interval or less."""
+    x, y = np.asarray(pixel_centres(*residual.shape[1:]) - 0.5, np.float32)
+    steps = max(math.ceil(ahead - 1e-6), 1)
+    way = np.zeros_like(residual)
+    for _ in range(steps):
+        at = x + way[0], y + way[1]
+        there = [cv2.remap(plane, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in residual]
+        way = np.asarray(way + np.stack(there) * np.float32(ahead / steps), np.float32)
+    return way
 
 
 def _smooth(plane: Array, sigma: float) -> Array:
