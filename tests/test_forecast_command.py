@@ -9,6 +9,7 @@ import pytest
 import torch
 from data_files import write_pictures, write_text
 from forecast_clips import FRAMES, HEIGHT, WIDTH, Repeater, write_clip
+from onnx_files import write_mix
 from st_lpips_weights import public_state
 from stand_ins import put_module
 
@@ -129,6 +130,31 @@ def test_estimators_take_the_place_of_files(
     assert cli.main([*told, "--depth-model", "zoe"]) == 0
     assert cli.main(told) == 0
     assert calls == [("depth of zoe", "classes of former"), ("depth of zoe", None)]
+
+
+def test_onnx_files_are_estimators(folder: Path, tmp_path: Path, repeater: Repeater) -> None:
+    """Depth is 10 times the red, and class 1 of two, a car, is where blue exceeds red."""
+    depth = write_mix(tmp_path / "depth.onnx", [[1.0, 0.0, 0.0]], metres=10)
+    scores = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    classes = write_mix(tmp_path / "classes.onnx", scores, (HEIGHT, WIDTH), classes=[0, 13], std=1)
+    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1"]
+    assert cli.main([*told, "--depth-model", str(depth), "--mask-model", str(classes)]) == 0
+    sample = repeater.calls[0][0][1]
+    image = sample.read_image()
+    assert sample.read_depth().shape == (1, HEIGHT, WIDTH) and sample.read_depth().max() <= 10
+    assert ((sample.read_labels() == 13) == (image[2:] > image[:1])).all()
+
+
+@pytest.mark.parametrize("option", ["--depth-model", "--mask-model"])
+def test_networks_that_cannot_be_had_are_one_line(
+    option: str, folder: Path, tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), option]
+    (tmp_path / "text.onnx").write_text("no network")
+    for value, message in (("missing.onnx", "there is no file"), ("text.onnx", "is no ONNX file")):
+        assert cli.main([*told, str(tmp_path / value)]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ") and error.count("\n") == 1 and message in error and value in error
 
 
 def test_a_missing_extra_is_one_line(

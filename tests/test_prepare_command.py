@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from data_files import write_text
+from onnx_files import write_mix
 from prepare_scenes import FRAMES, HEIGHT, SMALL, WIDTH, contents, counted, options, run, write_drive
 
 from vestcl import cli, prepare_command
@@ -30,6 +31,18 @@ def test_estimators_are_told_apart_by_name_or_files(tmp_path: Path) -> None:
     weights.write_text("123")
     names.append(prepare_command.estimators(options(depth_model=str(tmp_path / "network"))))
     assert len(set(names)) == 6 and names[0] == ""
+
+
+def test_onnx_files_are_told_apart_with_their_description(tmp_path: Path) -> None:
+    file = write_mix(tmp_path / "network.onnx", [[1.0, 0.0, 0.0]])
+    keys = [prepare_command.estimators(options(depth_model=str(file)))]
+    for text in ('{"metres": 2}', '{"metres": 33}'):
+        file.with_suffix(".json").write_text(text)
+        keys.append(prepare_command.estimators(options(depth_model=str(file))))
+    keys.append(prepare_command.estimators(options(mask_model=str(file))))
+    write_mix(file, [[1.0, 0.0, 0.0]], (44, 66))
+    keys.append(prepare_command.estimators(options(depth_model=str(file))))
+    assert len(set(keys)) == 5
 
 
 def test_shards_part_the_clips() -> None:

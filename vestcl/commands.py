@@ -153,9 +153,11 @@ class Forecast:
     label_ids: Literal["trainIds", "labelIds", "virtual_kitti"] = "trainIds"
     """What they hold."""
     depth_model: str | None = None
-    """Estimate depth by this checkpoint (a folder, or a name on huggingface.co)."""
+    """Estimate depth by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
+    huggingface.co."""
     mask_model: str | None = None
-    """Estimate classes by this checkpoint (a folder, or a name on huggingface.co)."""
+    """Estimate classes by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
+    huggingface.co."""
     rig: str | None = None
     """KITTI: colour or grey cameras."""
     sequence: str | None = None
@@ -218,9 +220,11 @@ class Prepare:
     label_ids: Literal["trainIds", "labelIds", "virtual_kitti"] = "trainIds"
     """What they hold."""
     depth_model: str | None = None
-    """Estimate depth by this checkpoint (a folder, or a name on huggingface.co)."""
+    """Estimate depth by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
+    huggingface.co."""
     mask_model: str | None = None
-    """Estimate classes by this checkpoint (a folder, or a name on huggingface.co)."""
+    """Estimate classes by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
+    huggingface.co."""
     rig: str | None = None
     """KITTI: colour or grey cameras."""
     sequence: str | None = None

@@ -16,6 +16,10 @@ STREET: Final = re.compile(r"street:(\d{1,18})")
 #: What an input is not, though it looks like one that vestcl could open.
 _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://.*", re.DOTALL)
 
+#: Suffixes of files that an estimator may be, and of files that hold weights only.
+_NETWORK_FILES: Final = (".onnx", ".json")
+_WEIGHTS: Final = (".safetensors", ".bin", ".pt", ".pth", ".ckpt", ".h5")
+
 #: Bytes of a forecast frame per pixel and view: colour, depth, coverage and 3D motion, float32.
 _RESULT_BYTES: Final = 4 * (3 + 1 + 1 + 3)
 
@@ -55,6 +59,41 @@ def check_folders(options: "cli.Forecast") -> None:
         if folder is not None and not folder.is_dir():
             what = "is no folder" if folder.exists() else "does not exist"
             raise ValueError(f"`{name}` must be a folder of files with the frames' names, and {folder} {what}")
+
+
+def is_network_file(name: str, value: str) -> bool:
+    """Whether an estimator is a file: of an ONNX network, or its JSON. Else it is a checkpoint's folder or hub name.
+
+    Only what exists counts: a folder NETWORK.onnx is a folder.
+
+    Args:
+        name: of the option.
+        value: a path or a hub name.
+
+    Raises:
+        ValueError: a file of another kind, a folder that has but ONNX files, or a path of a file that does not exist.
+    """
+    path = Path(value)
+    if path.is_dir():
+        networks = sorted(file.name for file in path.glob("*.onnx"))
+        if networks and not (path / "config.json").exists():
+            raise ValueError(
+                f"`{name}` is a folder without config.json: {value}; its ONNX networks are files: {path / networks[0]}"
+            )
+        return False
+    is_named_file = path.suffix.lower() in _NETWORK_FILES
+    if not path.exists():
+        if is_named_file:
+            raise ValueError(f"`{name}` must be a file, a folder or a name on huggingface.co: there is no file {value}")
+        return False
+    if not path.is_file():
+        raise ValueError(f"`{name}` must be a file, a folder or a name on huggingface.co: {value} is neither")
+    if path.suffix.lower() in _WEIGHTS:
+        raise ValueError(
+            f"`{name}` must be an ONNX file or a folder, got {value}, which holds weights without their network: "
+            f"give its folder, or export to ONNX"
+        )
+    return True
 
 
 def check(options: "cli.Forecast") -> None:

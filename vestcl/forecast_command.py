@@ -201,19 +201,26 @@ def _resized(clip: Clip, height: int | None, width: int | None) -> Clip:
 
 
 def load_estimators(options: "cli.Forecast") -> Estimators:
-    """The estimators that the options name.
+    """The estimators that the options name: an existing file is an ONNX network, anything else a checkpoint.
 
     Raises:
-        ValueError: an estimator whose package or checkpoint is not there.
+        ValueError: an estimator whose package, file or checkpoint is missing, or a file that is no network.
     """
     if options.depth_model is None and options.mask_model is None:
         return Estimators(None, None)
     from vestcl.scene import estimators
 
+    depth: DepthOf | None = None
+    classes: ClassesOf | None = None
     try:
-        depth = None if options.depth_model is None else estimators.DepthEstimator.load(options.depth_model)
-        classes = None if options.mask_model is None else estimators.SegmentationEstimator.load(options.mask_model)
-    except ImportError as error:  # of the optional package; its message tells how to get it
+        if options.depth_model is not None:
+            is_file = forecast_checks.is_network_file("depth_model", options.depth_model)
+            depth = (estimators.OnnxDepth if is_file else estimators.DepthEstimator).load(options.depth_model)
+        if options.mask_model is not None:
+            is_file = forecast_checks.is_network_file("mask_model", options.mask_model)
+            kind = estimators.OnnxSegmentation if is_file else estimators.SegmentationEstimator
+            classes = kind.load(options.mask_model)
+    except ImportError as error:  # of the optional package; its message names the remedy
         raise ValueError(str(error)) from error
     return Estimators(depth, classes)
 

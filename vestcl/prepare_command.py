@@ -18,7 +18,7 @@ from vestcl import interrupt
 from vestcl.data.sample import Clip
 from vestcl.data.street import Street
 from vestcl.data.street_drive import Sway
-from vestcl.forecast_checks import check_file_options
+from vestcl.forecast_checks import check_file_options, is_network_file
 from vestcl.forecast_command import open_clip
 from vestcl.prepare_clip import Outcome, Report, prepare_clip
 from vestcl.prepare_workers import Task, Told, run_tasks
@@ -191,13 +191,22 @@ def _cache(text: str, options: "cli.Prepare") -> Path:
 
 
 def estimators(options: "cli.Prepare") -> str:
-    """What tells the networks apart that the options name: hub names, or a folder's files, their sizes and times."""
+    """A key of the networks that the options name: hub names, or a network's files, their sizes and times."""
     told = []
     for model in (options.depth_model, options.mask_model):
-        files = sorted(path for path in Path(model).rglob("*") if path.is_file()) if model else []
+        files = _files_of(Path(model)) if model else []
         about = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
         told.append(repr(about) if about else repr(model))
     return "|".join(told) if any((options.depth_model, options.mask_model)) else ""
+
+
+def _files_of(model: Path) -> list[Path]:
+    """A folder's files; an ONNX network's: itself, its JSON, its weights where they lie in other files."""
+    if is_network_file("model", str(model)):
+        from vestcl.scene.estimators.onnx import network_files
+
+        return network_files(model)
+    return sorted(path for path in model.rglob("*") if path.is_file())
 
 
 def _prepare(task: Task, waits: bool, report: Report, options: "cli.Prepare") -> Outcome | None:
