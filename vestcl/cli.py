@@ -19,7 +19,7 @@ __all__ = ["Bench", "Demo", "Devices", "Doctor", "Forecast", "Prepare", "main"]
 #: `vestcl bench train-step` is vestcl.bench.train_step; its ``main`` takes a TrainStepBench, may return an exit code.
 _BENCHES: Final = (
     *("splat", "operators", "pipeline", "train-step", "network"),
-    *("pareto", "stability", "inpaint", "camera", "forecast", "compare"),
+    *("pareto", "stability", "inpaint", "camera", "depth", "forecast", "compare"),
 )
 
 

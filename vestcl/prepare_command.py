@@ -36,6 +36,9 @@ MOST_STREETS: Final = 100_000
 #: Where a data set's cache is without ``out``: in it, or for a file beside it.
 BESIDE: Final = ".vestcl"
 
+#: How a network's depth is used, in a cache's key: combined with motion's.
+COMBINED: Final = "combined"
+
 #: With random driving, a street's clip starts somewhere in its first minute, so that all phases of its sway come up.
 STARTS: Final = (0.0, 60.0)
 
@@ -197,6 +200,8 @@ def estimators(options: "cli.Prepare") -> str:
         files = _files_of(Path(model)) if model else []
         about = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
         told.append(repr(about) if about else repr(model))
+    if options.depth_model:
+        told.append(COMBINED)
     return "|".join(told) if any((options.depth_model, options.mask_model)) else ""
 
 

@@ -17,7 +17,9 @@ from vestcl.geometric import objects
 from vestcl.geometric.photometric import Pair, confirmed, search
 from vestcl.io.labels import SKY, background
 from vestcl.scene.correspondence import Correspondence, correspond
+from vestcl.scene.depth import CombinedDepth, combine_depth
 from vestcl.scene.ego_motion import ego_motion
+from vestcl.scene.estimators.sources import EstimatedFrame
 from vestcl.scene.layers import Layers, build_layers
 from vestcl.scene.lidar import densify
 from vestcl.scene.motion import backtest
@@ -68,7 +70,8 @@ class Perception:
     `Perception`; one computes at a time.
 
     ``seconds`` tells the time by stage. Depth comes from the clip (scans are densified), else from its stereo pair,
-    else from motion; masks from labels, else from motion. A depth map without a valid pixel is as a missing one, and
+    else from motion; a network's depth of a clip without a stereo pair is combined with motion's (`combine_depth`).
+    Masks come from labels, else from motion. A depth map without a valid pixel is as a missing one, and
     is logged. Across a gap in time that is too long to match the frames on both sides of it, the camera moves on at the
     velocity before, and depth from motion is that of a level road; see `is_lost`.
     """
@@ -154,6 +157,8 @@ class Perception:
 
     def _depth(self, index: int) -> NDArray[np.float32]:
         sample, depth = self.clip[index], self._given_depth(index)
+        if self._is_estimated(index):
+            return self._combined(index).depth
         if depth is not None:
             return depth if (depth > 0).mean() >= _DENSE else densify(depth, self.image(index), sky=self._sky(index))
         if sample.right is None:
@@ -189,7 +194,35 @@ class Perception:
         return None
 
     def _is_monocular(self, index: int) -> bool:
-        return self.clip[index].right is None and self._given_depth(index) is None
+        """Whether depth comes, wholly or in part, from the motion of one camera."""
+        return self.clip[index].right is None and (self._given_depth(index) is None or self._is_estimated(index))
+
+    def _is_estimated(self, index: int) -> bool:
+        """Whether depth is a network's, to be combined with what motion shows."""
+        sample = self.clip[index]
+        return (
+            isinstance(sample.depth, EstimatedFrame) and sample.right is None and self._given_depth(index) is not None
+        )
+
+    def _combined(self, index: int) -> CombinedDepth:
+        return self._once("combined depth", index, lambda: self._combine(index))
+
+    def _combine(self, index: int) -> CombinedDepth:
+        sample, estimate = self.clip[index], self._given_depth(index)
+        assert estimate is not None and isinstance(sample.depth, EstimatedFrame)
+        static = ~sample.read_ego_vehicle()
+        if sample.labels is not None:
+            static &= sample.read_mask()
+        if len(self.clip) == 1 or self.is_lost(index):
+            frames = [index]
+        elif index == 0:
+            frames = [1, 0]
+        else:
+            frames = list(range(index - 1 if self.is_lost(index - 1) else max(index - 2, 0), index + 1))
+        known = self.correspondence(index) if len(frames) > 1 and index > 0 else None
+        images = [self.image(i) for i in frames]
+        metric = sample.depth.metric
+        return combine_depth(estimate, images, sample.K, metric=metric, static=static, correspondence=known)
 
     def _from_motion(self, index: int) -> MotionDepth:
         if len(self.clip) < 2:
@@ -207,6 +240,8 @@ class Perception:
     def _ego_motion(self, index: int) -> NDArray[np.float64]:
         if self.is_lost(index):
             return power(self.prev_from_cur(index - 1), self.clip.elapsed(index) / self.clip.elapsed(index - 1))
+        if self._is_estimated(index):
+            return self._combined(index).prev_from_cur
         if self._is_monocular(index):
             return self._from_motion(index).prev_from_cur
         sample = self.clip[index]

@@ -82,11 +82,7 @@ def motion_depth(
     K = _check.matrix("K", K, 3)
     if not camera_height > 0:
         raise ValueError(f"`camera_height` must be above 0 m, got {camera_height}")
-    flows = [correspond(pictures[-1], pictures[-2]) if correspondence is None else correspondence]
-    flows += [correspond(pictures[-1], earlier) for earlier in pictures[-3 : -2 - _VIEWS : -1]]
-    poses = [relative_pose(flow, K) for flow in flows]
-    measured = measure(pictures[-1], flows, poses, K)
-    motion = poses[0].dst_from_src.copy()
+    motion, measured = observe(pictures, K, correspondence)
     rays = rays_of(K, *pictures[-1].shape[1:])
     if measured is None:
         nothing = Measured(rays[0] * 0, np.full_like(rays[0], np.inf), np.zeros(rays[0].shape, bool), [0.0])
@@ -96,6 +92,26 @@ def motion_depth(
     motion[:3, 3] *= metres * measured.lengths[0]
     scaled = measured._replace(inverse=measured.inverse / metres, std=measured.std / metres)
     return _complete(scaled, _ground(plane, rays, camera_height), pictures[-1], motion)
+
+
+def observe(
+    pictures: Sequence[NDArray[np.float32]], K: Array, correspondence: Correspondence | None = None
+) -> tuple[Array, Measured | None]:
+    """What flow from the last image to up to two earlier ones measures.
+
+    Args:
+        pictures: [3, H, W] each, oldest first, two or more.
+        K: [3, 3] px.
+        correspondence: from the last image to the one before, where it is known already.
+
+    Returns:
+        [4, 4] from the last camera to the one before, of unit length or without a translation; inverse depth, None
+        where no view has a translation.
+    """
+    flows = [correspond(pictures[-1], pictures[-2]) if correspondence is None else correspondence]
+    flows += [correspond(pictures[-1], earlier) for earlier in pictures[-3 : -2 - _VIEWS : -1]]
+    poses = [relative_pose(flow, K) for flow in flows]
+    return poses[0].dst_from_src.copy(), measure(pictures[-1], flows, poses, K)
 
 
 def _pictures(images: Sequence[ArrayLike]) -> list[NDArray[np.float32]]:

@@ -38,12 +38,14 @@ class _Kept(Generic[Element]):
 
 
 @dataclass(frozen=True, eq=False)
-class _EstimatedFrame(Generic[Element]):
+class EstimatedFrame(Generic[Element]):
     """One frame's estimate: a DepthSource or a LabelSource."""
 
     image: ImageSource
     frame: int
     kept: _Kept[Element]
+    metric: bool = True
+    """Of depth: whether it is in metres."""
 
     def read(self) -> NDArray[Element]:
         """[1, H, W] at the picture's own size: metres, or train ids."""
@@ -98,7 +100,7 @@ def with_estimates(
     Args:
         clip: of any reader, resized or not.
         depth: [3, H, W] RGB in [0, 1] -> [1, H, W] m, 0 = unknown: a `DepthEstimator` or any function; None leaves
-            the clip's own.
+            the clip's own. An attribute ``metric`` that is False says that it is in no unit, as `OnnxDepth.metric`.
         segmentation: [3, H, W] -> [1, H, W] uint8 train ids, 255 = void: a `SegmentationEstimator` or any function;
             None leaves the clip's own.
 
@@ -107,12 +109,13 @@ def with_estimates(
         with another shape or with depths or classes that can't be.
     """
     depths = None if depth is None else _Kept(CheckedDepth(depth))
+    metric = bool(getattr(depth, "metric", True))
     classes = None if segmentation is None else _Kept(CheckedClasses(segmentation))
     samples = tuple(
         replace(
             sample,
-            depth=sample.depth if depths is None else _EstimatedFrame(sample.image, frame, depths),
-            labels=sample.labels if classes is None else _EstimatedFrame(sample.image, frame, classes),
+            depth=sample.depth if depths is None else EstimatedFrame(sample.image, frame, depths, metric),
+            labels=sample.labels if classes is None else EstimatedFrame(sample.image, frame, classes),
         )
         for frame, sample in enumerate(clip)
     )
