@@ -65,6 +65,16 @@ def test_what_does_not_go_together(arguments: Any, words: str) -> None:
         later_frames(*arguments)
 
 
+def test_depth_without_a_unit_is_not_for_forecast_frames() -> None:
+    relative: Any = type("Relative", (), {"metric": False, "__call__": lambda self, image: depth(image)})()
+    assert later_frames(TINY, None, None, relative).perceived == "splatted"
+    with pytest.raises(ValueError, match=r'"estimated" needs --depth-model \(in metres\)'):
+        later_frames(TINY, None, "estimated", relative)
+    image, metres, mask = scene()
+    perceive = later_frames(TINY, None, None, relative, classes).perceive
+    assert perceive is not None and (perceive(image, metres, mask).depth[:, :, 4:] == 20).all()
+
+
 def test_both_estimators_see_the_forecast_frame() -> None:
     image, metres, mask = scene()
     layers = perceive_estimated(depth, classes)(image, metres, mask)

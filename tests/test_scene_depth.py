@@ -1,14 +1,15 @@
 """vestcl.scene.depth: a network's depth and parallax combined in a corridor, and errors against scans."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from corridor_scenes import HEIGHT, WIDTH, K, ahead, drive, off
-from data_files import real
+from data_files import pose, real
 
 from vestcl.data.open import open_sequence
-from vestcl.data.sample import Clip, Sample
+from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.geometric import Perception
 from vestcl.scene.depth import combine_depth, depth_scores
 from vestcl.scene.depth.scores import DepthScores
@@ -126,6 +127,20 @@ def test_a_clip_with_a_network(metric: bool) -> None:
     for index in (1, 2):
         assert np.linalg.norm(perception.prev_from_cur(index)[:3, 3]) == pytest.approx(0.4, rel=0.1)
     assert perception.seen(2).layers.depth.shape == (1, HEIGHT, WIDTH)
+
+
+def test_a_stereo_pair_is_replaced_by_metres_only() -> None:
+    """Metric depth of a clip with a right camera stays as it is; depth without a unit gets one."""
+    poses = ahead(frames=3)
+    shots = [drive(poses[: i + 1]) for i in range(3)]
+    images, depths = shots[-1][0], [depth for _, depth in shots]
+    plain = clip_of(images)
+    rig = RightCamera(plain[0].image, K, pose(xyz=(-0.5, 0, 0)))
+    clip = replace(plain, samples=tuple(replace(sample, right=rig) for sample in plain))
+    for metric in (True, False):
+        network = Network(images, depths, metric)
+        found = Perception(with_estimates(clip, depth=network)).raw_depth(2)
+        assert np.array_equal(found, depths[2]) if metric else np.median(off(found, depths[2])) < 0.06
 
 
 # ---------------------------------------------------------------- errors

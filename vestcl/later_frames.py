@@ -53,7 +53,7 @@ def later_frames(
         config: of the model; has the default mode.
         mode: the option; None takes that default.
         perceived: the option; None is "estimated" if there is an estimator, else "splatted".
-        depth: the depth estimator, if one was asked for.
+        depth: the depth estimator, if one was asked for; one whose ``metric`` is False is not used for forecast frames.
         segmentation: the estimator of classes, if one was asked for.
 
     Returns:
@@ -67,9 +67,11 @@ def later_frames(
         if perceived is not None:
             raise ValueError(f'`perceive` must not be given with mode "compose", got {perceived!r}: --mode feedback')
         return LaterFrames(mode, None, None)
+    if not getattr(depth, "metric", True):
+        depth = None  # without a unit: the splatted depth is in metres
     has_estimator = depth is not None or segmentation is not None
     if perceived == "estimated" and not has_estimator:
-        raise ValueError('`perceive` "estimated" needs --depth-model, --mask-model or both')
+        raise ValueError('`perceive` "estimated" needs --depth-model (in metres), --mask-model or both')
     perceived = perceived or ("estimated" if has_estimator else "splatted")
     perceive = perceive_estimated(depth, segmentation) if perceived == "estimated" else None
     return LaterFrames(mode, perceived, perceive)

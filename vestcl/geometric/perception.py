@@ -195,14 +195,14 @@ class Perception:
 
     def _is_monocular(self, index: int) -> bool:
         """Whether depth comes, wholly or in part, from the motion of one camera."""
-        return self.clip[index].right is None and (self._given_depth(index) is None or self._is_estimated(index))
+        return self._is_estimated(index) or (self.clip[index].right is None and self._given_depth(index) is None)
 
     def _is_estimated(self, index: int) -> bool:
-        """Whether depth is a network's, to be combined with what motion shows."""
+        """Whether depth is a network's, to be combined with motion's: without a stereo pair, or without a unit."""
         sample = self.clip[index]
-        return (
-            isinstance(sample.depth, EstimatedFrame) and sample.right is None and self._given_depth(index) is not None
-        )
+        if not isinstance(sample.depth, EstimatedFrame) or self._given_depth(index) is None:
+            return False
+        return sample.right is None or not sample.depth.metric
 
     def _combined(self, index: int) -> CombinedDepth:
         return self._once("combined depth", index, lambda: self._combine(index))
