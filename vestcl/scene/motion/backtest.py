@@ -29,6 +29,10 @@ _MOST, _NOISE = 0.05, 1e-5
 #: along the flow, so that it need not be exact, and then.
 _WIDTH, _BEFORE, _AFTER = 832, 2.0, 8.0
 
+#: Flow itself must do as well as the others over the whole image: by chance it does so in places, and it forecasts what
+#: comes nearer worse with every step. Its errors grow with this power of their mean over the least of the others.
+_WHOLE: Final = 4.0
+
 #: Flow that leaves the rigid motion by more pixels an interval than that is a wrong match.
 _LARGEST: Final = 40.0
 
@@ -74,7 +78,7 @@ def candidates(frame: Frame, future_from_cur: NDArray[np.float64], ahead: float)
 
     The candidates: its object's velocity; rest in the world; rest and ``ahead`` times the residual flow r; rest and r
     followed from place to place, as objects that come to the end of where r was seen slow down in the mean. Where
-    depth is from motion also flow itself, p - ahead flow / elapsed, which knows of no depth.
+    depth is from motion also, last, flow itself, p - ahead flow / elapsed, which knows of no depth.
 
     Args:
         frame: that is looked at.
@@ -116,6 +120,9 @@ def backtest(positions: Array, before: Frame, after: Array, flows: Sequence[Arra
         smooth = _smooth(np.minimum(error, np.float32(_MOST)), _BEFORE)
         brought = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         errors.append(_smooth(np.asarray(brought, np.float32), _AFTER) + np.float32(_NOISE))
+    if before.monocular:
+        others = min(float(error.mean()) for error in errors[:-1])
+        errors[-1] = errors[-1] * np.float32(max(float(errors[-1].mean()) / others, 1.0) ** _WHOLE)
     return np.stack(errors)
 
 

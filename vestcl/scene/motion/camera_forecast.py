@@ -36,9 +36,10 @@ from vestcl.scene.motion.gauss_markov import (
 
 Array = NDArray[np.float64]
 
-#: Standard deviation of a measured rotation, rad an axis: what PnP over a dense flow gives on a driving video with
-#: depth, and of the yaw without depth, as a turn and a step aside look much alike.
-_TURN_NOISE: Final = (np.radians(0.045), np.radians(0.12))
+#: Standard deviation of a measured rotation, rad an axis: of flow between two sharp images (a tenth of a pixel), what
+#: PnP over a dense flow gives on a driving video with depth, and of the yaw without depth, as a turn and a step aside
+#: look much alike.
+_TURN_NOISE: Final = (np.radians(0.01), np.radians(0.045), np.radians(0.12))
 
 #: Yaw rate: it decays within the seconds that a bend takes, its rate of change follows the steering wheel (s), and
 #: reaches from a lane's corrections to a crossing's (rms, rad/s^2: a turn of 30 degrees/s entered within 1 s is 0.5).
@@ -81,11 +82,9 @@ _YAW: Final = tuple(
     for decay, seconds, rms, noise in itertools.product(_BENDS, _STEERING, _TURNING, _TURN_NOISE)
 )
 _NOD: Final = tuple(
-    joined(
-        oscillator(hertz, damping, np.radians(degrees)), decaying_rate(seconds, np.radians(rate)), noise=_TURN_NOISE[0]
-    )
-    for hertz, damping, degrees, rate, seconds in itertools.product(
-        _BODY_HERTZ, _BODY_DAMPING, _BODY_DEGREES, _ROAD_RATES, _ROAD_SECONDS
+    joined(oscillator(hertz, damping, np.radians(degrees)), decaying_rate(seconds, np.radians(rate)), noise=noise)
+    for hertz, damping, degrees, rate, seconds, noise in itertools.product(
+        _BODY_HERTZ, _BODY_DAMPING, _BODY_DEGREES, _ROAD_RATES, _ROAD_SECONDS, _TURN_NOISE[:2]
     )
 )
 _SPEED: Final = tuple(
