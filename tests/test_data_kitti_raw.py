@@ -8,6 +8,7 @@ from data_files import pose, row, write_pictures, write_text
 
 from vestcl import io
 from vestcl.data.kitti_raw import EARTH_RADIUS, mercator_pose, open_kitti_raw
+from vestcl.inputs import inputs_of
 
 #: Of 2011_09_26's published calib_cam_to_cam.txt.
 P2 = "7.215377e+02 0 6.095593e+02 4.485728e+01 0 7.215377e+02 1.728540e+02 2.163791e-01 0 0 1 2.745884e-03"
@@ -128,12 +129,21 @@ def test_depth_from_the_scanner(tmp_path: Path) -> None:
         clip[1].read_depth()
 
 
-def test_depth_maps_come_first(tmp_path: Path) -> None:
+def test_accumulated_depth_is_read_only_where_it_is_asked_for(tmp_path: Path) -> None:
+    """Its maps hold the scans of later frames."""
     path = drive(tmp_path)
     maps = path / "proj_depth" / "groundtruth" / "image_02"
+    with pytest.raises(ValueError, match=r"`accumulated_depth` needs KITTI's depth maps, and .*image_02 has none"):
+        open_kitti_raw(path, accumulated_depth=True)
     io.write_depth(maps / "0000000001.png", np.full(SIZE, 3.0), 256)
-    clip = open_kitti_raw(path)
+    assert all(sample.depth is None for sample in open_kitti_raw(path))
+    scan = path / "velodyne_points" / "data" / "0000000001.bin"
+    scan.parent.mkdir(parents=True)
+    np.array([[10, 0, 0, 0]], "<f4").tofile(scan)
+    assert open_kitti_raw(path)[1].read_depth().max() == pytest.approx(10, abs=0.01)
+    clip = open_kitti_raw(path, accumulated_depth=True)
     assert clip[0].depth is None and (clip[1].read_depth() == 3).all()
+    assert inputs_of(clip).depth.startswith("KITTI's depth maps, accumulated from scans of frames around each, later")
 
 
 def test_without_what_may_be_missing(tmp_path: Path) -> None:

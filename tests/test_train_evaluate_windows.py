@@ -138,9 +138,7 @@ def test_clips_as_they_are_evaluated() -> None:
     )
     blind = [dataclasses.replace(s, depth=None, right=None, labels=None if i else s.labels) for i, s in enumerate(clip)]
     mono = dataclasses.replace(clip, samples=tuple(blind))
-    assert (
-        known_of(mono, ("motion",)) == "Depth is from motion, masks are from labels where there are any, else motion."
-    )
+    assert known_of(mono, ("motion",)) == "Depth is from motion, masks are from motion."  # labels of one frame only
 
 
 def test_views_that_a_clip_has() -> None:

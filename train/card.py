@@ -24,7 +24,7 @@ from train.card_tables import Weights, about_model, data_table, prepare_commands
 from train.checkpoint import State
 from train.command import ERRORS, failed, warnings_in_lines
 from train.config import Config, from_dict
-from train.evaluate import Evaluation
+from train.evaluate_options import Evaluation
 from train.protocols import PROTOCOLS
 from train.report import LOG, read_log
 from vestcl import command_line, interrupt
@@ -234,12 +234,13 @@ def _evaluate_command(told: dict[str, Any], weights: Weights) -> str:
     usual = {field.name: field.default for field in dataclasses.fields(Evaluation)}
     usual |= {"steps": plain.steps, "first": plain.first, "last": plain.last, "mode": weights.config.default_mode}
     usual |= dict(zip(("height", "width"), plain.size, strict=True))
-    settings = told["settings"] | {"height": height, "width": width, "data": told["settings"]["data"] and "DATA"}
+    folders = {name: told["settings"].get(name) and name.upper() for name in ("data", "prepared")}
+    settings = told["settings"] | {"height": height, "width": width, **folders}
     words = ["python -m train.evaluate", name, f"--model {weights.name}"]
     for option, value in settings.items():
         given = tuple(value) if isinstance(value, list) else value
         if option in usual and option != "protocol" and value is not None and given != usual[option]:
-            words.append(f"--{option}" + ("" if value is True else f" {value}" if given is value else
+            words.append(f"--{option.replace('_', '-')}" + ("" if value is True else f" {value}" if given is value else
                                           " " + " ".join(map(str, given))))  # fmt: skip
     measured = {"squeeze": "--squeeze WEIGHTS", "st_lpips": "--st-lpips"}
     return " ".join([*words, *(option for name, option in measured.items() if name in told["weights"])])

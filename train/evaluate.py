@@ -1,7 +1,8 @@
 """Evaluate models by the paper's protocols: `python -m train.evaluate PROTOCOL --model FILE --data FOLDER`.
 
-Beside each model stand: the last frame repeated, optical flow at constant velocity, and the geometric forecast, which
-needs no weights. All get the same frames at the same size, and models the geometric forecast's depth and masks.
+Next to each model there are: the last frame repeated, optical flow at constant velocity, and the geometric forecast,
+which needs no weights. All get the same frames at the same size, and models the geometric forecast's depth and masks;
+every table names where these come from.
 `train.protocols` says what is evaluated, `train.evaluate_windows` how one window is, `train.evaluate_report` what
 comes out.
 
@@ -11,117 +12,45 @@ its code: delete the folder when that has changed). Several processes share the 
 """
 
 import dataclasses
-import hashlib
 import json
 import os
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from train import evaluate_report as report
 from train.command import ERRORS, failed
-from train.evaluate_inputs import check_stereo, depths, known_of, plain
+from train.evaluate_inputs import Preprocessing, check_prepared, check_stereo, plain
+from train.evaluate_key import about_run, key_of
 from train.evaluate_leaks import training_overlap
+from train.evaluate_options import Evaluation, check_options
+from train.evaluate_setup import Setup
 from train.evaluate_sheets import write_sheets
-from train.evaluate_windows import PART_WINDOWS, Part, Setup, plan, prepared, read_part, run_part
-from train.protocols import HELD_OUT, NOW_NOTE, PROTOCOLS, Name, Protocol, Source, Where
+from train.evaluate_windows import Part, plan, read_inputs, read_part, run_part
+from train.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
-from vestcl import __version__, command_line, interrupt, peer, runtime, st_lpips
+from vestcl import __version__, command_line, interrupt, peer, runtime
 from vestcl.bench import _results
+from vestcl.inputs import Inputs
 from vestcl.io.atomic import write_bytes
 from vestcl.metrics import MS_SSIM_SIDE
-from vestcl.models.forecaster import Forecaster, Mode
+from vestcl.models.forecaster import Forecaster
 from vestcl.models.trunks import load_trunk
 from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.perceptual import Lpips, StLpips
 from vestcl.prepare_command import shard
 from vestcl.progress import Bar
 from vestcl.scoring import GEOMETRIC, Record, to_rich
-from vestcl.st_lpips import Option as StLpipsOption
 
 #: Columns where tables don't go to a terminal.
 WIDTH: Final = 200
 
-#: Settings that scores do not depend on, or that stand in the key as the content of files.
-_NOT_IN_KEY: Final = (
-    "model",
-    "squeeze",
-    "lpips",
-    "st_lpips",
-    "peer",
-    "out",
-    "shard",
-    "merge",
-    "device",
-    "horizons",
-    "sheets",
-)
-
-#: Of the scores' files: raised when what a window is given or how it is scored changes.
-_SCORING: Final = 2
-
 #: What of a protocol its published figures depend on.
 _PUBLISHED: Final = ("size", "steps", "first", "last")
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Score models and baselines on every window of a protocol."""
-
-    protocol: tyro.conf.Positional[Name]
-    """Which clips, windows, cameras and size."""
-    model: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
-    """A model's file, *.safetensors; more than one may be told. Tables call it by the file's stem."""
-    data: Path | None = None
-    """The data set's root, or for `clip` what `vestcl forecast` opens. `street` needs none."""
-    out: Path | None = None
-    """Folder for results and for what is done so far; without it out/PROTOCOL."""
-    squeeze: Path | None = None
-    """SqueezeNet 1.0 weights, for the distance in its features."""
-    lpips: tuple[Path, Path] | None = None
-    """Weights of AlexNet (torchvision) and of LPIPS's heads (v0.1)."""
-    st_lpips: StLpipsOption = None
-    """Measure ST-LPIPS, by the weights FILE or those inside an installed stlpips-pytorch."""
-    peer: Path | None = None
-    """Weights of the learned 2D baseline (`python -m train.peer` writes peer.safetensors)."""
-    height: int | None = None
-    """Pixels; without it the protocol's."""
-    width: int | None = None
-    """Pixels; without it the protocol's."""
-    steps: int | None = None
-    """Frames to forecast; without it the protocol's."""
-    horizons: tuple[int, ...] = ()
-    """Steps that tables show; without it the protocol's."""
-    every: int = 1
-    """Take every such window."""
-    first: int | None = None
-    """The first current frame t of a clip, from 0; without it the protocol's."""
-    last: int | None = None
-    """The last one."""
-    mode: Mode | None = None
-    """How models make steps after the first: compose the first motion, or feed each forecast frame back (feedback).
-    Without it each as it is meant to: feedback for models that start from rest, compose for vest-s."""
-    stereo: bool = False
-    """Take depth from stereo pairs even where clips have depth (laser scans, or a street's true depth). Rows that do
-    end in "stereo pair"; where the right camera's future is judged they come next to monocular ones."""
-    seeds: tuple[int, int] = (HELD_OUT[0], HELD_OUT[-1])
-    """Of streets: the first and the last."""
-    samples: int = 2
-    """Rays a pixel and direction, of streets."""
-    shard: str | None = None
-    """I/N, 0 <= I < N: do this share of the windows. Without it RANK and WORLD_SIZE tell, as torchrun sets them."""
-    merge: bool = False
-    """Forecast nothing: make the tables of what is done, which must be everything."""
-    sheets: bool = True
-    """Write contact sheets of the best, the median and the worst window."""
-    device: str | None = None
-    """OpenCL device: an index of `vestcl devices` or a part of its name."""
 
 
 @interrupt.command
@@ -150,8 +79,11 @@ def evaluate(config: Evaluation) -> None:
     protocol = protocol_of(config)
     setup, out = setup_of(config, protocol), config.out or Path("out") / config.protocol
     sources = protocol.sources(_where(config, protocol))
-    about = _about(config, protocol)
-    parts = plan(sources, protocol, setup.steps, config.every, out / "clips", _key(about))
+    if config.prepared is not None:
+        for source in sources:
+            check_prepared(source.opens(), protocol)
+    about = about_run(config, protocol)
+    parts = plan(sources, protocol, setup.steps, config.every, out / "clips", key_of(about))
     console = _results.console(WIDTH)
     device = config.device or Ranks(local=local_rank()).device()
     with runtime.use(device) as session:
@@ -165,12 +97,8 @@ def evaluate(config: Evaluation) -> None:
                 raise ValueError(f"`merge` needs all of them: {state}")
             console.print(f"{state}; the process that does the last makes the tables", highlight=False, soft_wrap=True)
             return
-        first = prepared(sources[0].opens(), setup)
-        notes = (known_of(first, depths(first, protocol, config.stereo)), *_caveats(config, setup))
-        leaks, unknown = training_overlap(config.model, parts, setup.steps)
-        names = tuple(setup.models)
-        results = report.Results(protocol, records, protocol.shown, names, notes + unknown, leaks, setup.modes)
-        models = {name: told | {"mode": setup.modes[name]} for name, told in about["models"].items()}
+        results = _results_of(config, setup, parts, records)
+        models = {name: model | setup.later[name].settings for name, model in about["models"].items()}
         _write(out, results, about | {"models": models, "machine": _results.describe(session)}, console)
         if config.sheets:
             _sheets(out, sources, setup, results, console)
@@ -191,6 +119,7 @@ def protocol_of(config: Evaluation) -> Protocol:
             raise ValueError(f"`{name}` must be 1 or more, got {value}")
     default = PROTOCOLS[config.protocol]
     check_stereo(default, config.stereo)
+    check_options(config)
     steps = config.steps or default.steps
     shown = config.horizons or tuple(k for k in default.shown if k <= steps) or (steps,)
     if not all(1 <= k <= steps for k in shown):
@@ -219,7 +148,11 @@ def setup_of(config: Evaluation, protocol: Protocol) -> Setup:
     shift_tolerant = None if config.st_lpips is None else StLpips.load(config.st_lpips)
     flow = None if config.peer is None else VoxelFlowNetwork.load(config.peer)
     size, steps = protocol.size, protocol.steps
-    return Setup(protocol, size, steps, models, config.mode, config.stereo, trunk, lpips, shift_tolerant, flow)
+    how = Preprocessing.load(config.depth_model, config.mask_model, config.inpaint)
+    networks = trunk, lpips, shift_tolerant, flow
+    setup = Setup(protocol, size, steps, models, config.mode, config.stereo, *networks, how, config.perceive)
+    _ = setup.later  # refuses what can't be perceived, before the work begins
+    return setup
 
 
 def _where(config: Evaluation, protocol: Protocol) -> Where:
@@ -227,34 +160,8 @@ def _where(config: Evaluation, protocol: Protocol) -> Where:
     first, last = config.seeds
     if first > last:
         raise ValueError(f"`seeds` must be from a lower to a higher one, got {config.seeds}")
-    return Where(config.data, range(first, last + 1), protocol.size, frames, config.samples)
-
-
-def _about(config: Evaluation, protocol: Protocol) -> dict[str, Any]:
-    """What the scores depend on, as results.json tells it."""
-    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_IN_KEY}
-    changed = {"data": None if config.data is None else str(config.data.resolve())}
-    effective = {k: getattr(protocol, k) for k in ("size", "steps", "first", "last")}
-    weights = {"squeeze": config.squeeze} | dict(zip(("alexnet", "lpips"), config.lpips or (), strict=False))
-    weights |= {"peer": config.peer, "st_lpips": config.st_lpips and st_lpips.find_weights(config.st_lpips)}
-    return {
-        "vestcl": __version__,
-        "settings": settings | changed | effective,
-        "models": {path.stem: {"file": str(path), "sha256": _sha256(path)} for path in config.model},
-        "weights": {name: _sha256(path) for name, path in weights.items() if path is not None},
-    }
-
-
-def _key(about: dict[str, Any]) -> str:
-    hashes = {name: model["sha256"] for name, model in about["models"].items()}
-    content = json.dumps(
-        about | {"models": hashes, "part": PART_WINDOWS, "scoring": _SCORING}, sort_keys=True, default=str
-    )
-    return hashlib.sha256(content.encode()).hexdigest()[:12]
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    seeds = range(first, last + 1)
+    return Where(config.data, seeds, protocol.size, frames, config.samples, config.prepared, config.accumulated_depth)
 
 
 def _caveats(config: Evaluation, setup: Setup) -> list[str]:
@@ -295,9 +202,23 @@ def _run(parts: Sequence[Part], setup: Setup, console: Console) -> None:
                 bar.advance(task, len(part.indices))
 
 
+def _results_of(config: Evaluation, setup: Setup, parts: Sequence[Part], records: Sequence[Record]) -> report.Results:
+    """What the tables are made of."""
+    inputs: dict[str, Mapping[str, Inputs]] = {part.source.name: read_inputs(part) or {} for part in parts}
+    leaks, unknown = training_overlap(config.model, parts, setup.steps)
+    perceived = {name: later.perceived for name, later in setup.later.items() if later.perceived is not None}
+    names, notes = tuple(setup.models), (*_caveats(config, setup), *unknown)
+    shown = setup.protocol.shown
+    return report.Results(setup.protocol, records, shown, names, notes, leaks, setup.modes, perceived, inputs)
+
+
 def _write(out: Path, results: report.Results, about: dict[str, Any], console: Console) -> None:
     machine = about["machine"]
-    models = [f"{name}: sha256 {told['sha256'][:16]}, mode {told['mode']}" for name, told in about["models"].items()]
+    models = [
+        f"{name}: sha256 {model['sha256'][:16]}, mode {model['mode']}"
+        + (f", perceive {model['perceive']}" if model["perceive"] else "")
+        for name, model in about["models"].items()
+    ]
     lines = [f"vestcl {__version__}, {machine['device']}, {machine['cores']} cores, {machine['date']}", *models]
     settings = ", ".join(f"{name} {value}" for name, value in about["settings"].items() if value is not None)
     for grid in report.short_grids(results):

@@ -6,9 +6,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
-from train.evaluate_inputs import label_of, plain
+from train.evaluate_inputs import label_of, plain, sentences
 from train.evaluate_windows import CONSTANT_VELOCITY
 from train.protocols import PAPER_NOTE, Protocol
+from vestcl.inputs import Inputs
 from vestcl.scoring import (
     GEOMETRIC,
     METRICS,
@@ -57,6 +58,15 @@ class Results:
     """Which models were trained on what is evaluated, a sentence each: notes of every table."""
     modes: Mapping[str, str] = field(default_factory=dict)
     """How each model made the steps after the first, as notes below tables name it."""
+    perceived: Mapping[str, str] = field(default_factory=dict)
+    """Where depth and mask of forecast frames came from, of models of mode "feedback"."""
+    inputs: Mapping[str, Mapping[str, Inputs]] = field(default_factory=dict)
+    """Where those of recorded frames came from, by clip and label of rows."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """All sentences: on inputs, on what was not measured, on what models were trained on."""
+        return (*sentences(self.inputs), *self.told, *self.leaks)
 
     def is_model(self, method: str) -> bool:
         """Whether a row is a model's, with whatever label."""
@@ -99,13 +109,18 @@ def short_grids(results: Results) -> list[Grid]:
 
 
 def _with_notes(grid: Grid, results: Results) -> Grid:
-    """With a note on how the models made later frames, and the sentences on models that were trained on what is
-    evaluated, once."""
-    named = ", ".join(f"{model} {mode}" for model, mode in results.modes.items())
-    modes = (f"Mode of later frames: {named}.",) if named else ()
-    is_paper = grid.title.endswith(_PAPER)
-    missing = () if is_paper else tuple(leak for leak in results.leaks if leak not in grid.notes)
-    return replace(grid, notes=(*grid.notes, *modes, *missing))
+    """With notes on inputs, on how the models made later frames, and on models that were trained on what is evaluated,
+    once."""
+    modes, perceived = (
+        ", ".join(f"{model} {how}" for model, how in of.items()) for of in (results.modes, results.perceived)
+    )
+    own = (
+        *sentences(results.inputs),
+        *([f"Mode of later frames: {modes}."] if modes else []),
+        *([f"Depth and masks of forecast frames (perceive): {perceived}."] if perceived else []),
+        *results.leaks,
+    )
+    return replace(grid, notes=(*grid.notes, *(note for note in own if note not in grid.notes)))
 
 
 def _interval_grid(view: str, records: Sequence[Record], results: Results) -> Grid:
@@ -188,7 +203,7 @@ def markdown(results: Results, about: Sequence[str]) -> str:
         results: all windows.
         about: lines on models, device and settings.
     """
-    head = [f"# {results.protocol.title}", "", *(f"- {line}" for line in (*about, *results.told, *results.leaks)), ""]
+    head = [f"# {results.protocol.title}", "", *(f"- {line}" for line in (*about, *results.notes)), ""]
     return "\n".join([*head, *map(to_markdown, grids(results))])
 
 
@@ -218,7 +233,11 @@ def as_json(results: Results, about: Mapping[str, Any]) -> dict[str, Any]:
     told: dict[str, Any] = {
         **about,
         "title": results.protocol.title,
-        "notes": [*results.told, *results.leaks],
+        "notes": list(results.notes),
+        "inputs": {
+            clip: {ending.strip(", "): of.as_entries() for ending, of in by_label.items()}
+            for clip, by_label in results.inputs.items()
+        },
         "summary": summarise(results.records),
         "intervals": _nested({key: _plain(intervals(own)) for key, own in groups.items()}),
         "differences": _nested({key: _plain(found) for key, found in _all_differences(results).items()}),

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.evaluate_inputs import label_of, plain
-from train.evaluate_windows import Setup, forecast, perceptions_of, prepared, views_of
+from train.evaluate_setup import Setup
+from train.evaluate_windows import forecast, perceptions_of, prepared, views_of
 from train.protocols import Source
 from vestcl import sheet
 from vestcl.io.images import write_pixels

@@ -13,19 +13,18 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
-from train.evaluate_inputs import depths, given, label, label_of, plain
+from train.evaluate_inputs import label_of, perceptions, plain
+from train.evaluate_setup import Setup
 from train.protocols import NOW, NOW_BORDER, Protocol, Source, currents
 from vestcl import network, peer
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
 from vestcl.geometric import Perception, forecast_frames, show_frame
+from vestcl.inputs import Inputs
 from vestcl.io.atomic import read_bytes, write_bytes
-from vestcl.models.forecaster import Forecaster, Mode
-from vestcl.models.trunks import Trunk
-from vestcl.models.voxel_flow import VoxelFlowNetwork
-from vestcl.perceptual import Lpips, StLpips
+from vestcl.models.forecaster import Forecaster
 from vestcl.scoring import (
     GEOMETRIC,
     OTHER_CAMERA,
@@ -56,33 +55,6 @@ Presenter = Callable[[Perception, int, Sequence[View]], dict[str, Rendered]]
 
 #: Baseline of the right camera's present: what the source camera sees.
 AS_SEEN: Final = f"unchanged{OTHER_CAMERA}"
-
-
-@dataclass(frozen=True, eq=False)
-class Setup:
-    """All that a window's scores depend on, besides its frames."""
-
-    protocol: Protocol
-    size: tuple[int, int]
-    """(height, width) px of what is forecast and scored."""
-    steps: int
-    models: Mapping[str, Forecaster]
-    """By the name that tables give them."""
-    mode: Mode | None = None
-    """How models make steps after the first; None is each one's default."""
-    stereo: bool = False
-    """Depth from the stereo pair although the clip has depth, see `train.evaluate_inputs.depths`."""
-    trunk: Trunk | None = None
-    """SqueezeNet 1.0."""
-    lpips: Lpips | None = None
-    st_lpips: StLpips | None = None
-    peer: VoxelFlowNetwork | None = None
-    """The learned 2D baseline, `vestcl.peer`."""
-
-    @property
-    def modes(self) -> dict[str, Mode]:
-        """How each model makes steps after the first."""
-        return {name: self.mode or model.config.default_mode for name, model in self.models.items()}
 
 
 @dataclass(frozen=True)
@@ -141,14 +113,16 @@ def run_part(part: Part, setup: Setup, advance: Callable[[], None] = lambda: Non
         ValueError: as the readers and forecasts.
     """
     clip = prepared(part.source.opens(), setup)
-    perceptions = perceptions_of(clip, setup)
+    seen = inputs_of(clip, setup)
     truth = Truth(clip, setup.size, setup.trunk, setup.lpips, setup.st_lpips)
     records: list[Record] = []
     for index in part.indices:
         truth.forget(index - 1)
-        records += window(perceptions, truth, index, setup)
+        records += window({ending: of[0] for ending, of in seen.items()}, truth, index, setup)
         advance()
-    content = {"windows": len(part.indices), "records": [dataclasses.asdict(record) for record in records]}
+    inputs = {ending: given.as_entries() for ending, (_, given) in seen.items()}
+    done = [dataclasses.asdict(record) for record in records]
+    content = {"windows": len(part.indices), "inputs": inputs, "records": done}
     write_bytes(part.file, json.dumps(content).encode())
 
 
@@ -158,27 +132,45 @@ def read_part(part: Part) -> list[Record] | None:
     Raises:
         ValueError: the file holds something else.
     """
+    return _read(part, lambda content: [Record(**record) for record in content["records"]])
+
+
+def read_inputs(part: Part) -> dict[str, Inputs] | None:
+    """What the part's frames were preprocessed with, by the label of rows; None where the part is not done.
+
+    Raises:
+        ValueError: as `read_part`.
+    """
+    return _read(part, lambda content: {ending: Inputs.read(of) for ending, of in content["inputs"].items()})
+
+
+def _read(part: Part, take: Callable[[Any], Made]) -> Made | None:
     if not part.file.is_file():
         return None
     try:
-        return [Record(**record) for record in json.loads(read_bytes(part.file))["records"]]
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        return take(json.loads(read_bytes(part.file)))
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise ValueError(f"{part.file}: holds no scores ({error}); delete it to have them made anew") from error
 
 
 def prepared(clip: Clip, setup: Setup) -> Clip:
-    """The clip at the size that is evaluated."""
-    return clip.resized(*setup.size)
+    """The clip at the size that is evaluated, with estimates in place of its own depth and labels."""
+    return setup.preprocessing.estimated(clip.resized(*setup.size))
 
 
-def perceptions_of(clip: Clip, setup: Setup) -> dict[str, Perception]:
-    """By the label of their rows, what forecasts see of the clip with each source of depth.
+def inputs_of(clip: Clip, setup: Setup) -> dict[str, tuple[Perception, Inputs]]:
+    """By the label of their rows, what forecasts see of the clip with each source of depth, and the sources in words.
 
     Args:
         clip: as `prepared` gives it.
-        setup: its protocol, and whether stereo pairs are asked for.
+        setup: its protocol, its preprocessing, and whether stereo pairs are asked for.
     """
-    return {label(depth): Perception(given(clip, depth)) for depth in depths(clip, setup.protocol, setup.stereo)}
+    return perceptions(clip, setup.protocol, setup.stereo, setup.preprocessing)
+
+
+def perceptions_of(clip: Clip, setup: Setup) -> dict[str, Perception]:
+    """The same without the words."""
+    return {ending: perception for ending, (perception, _) in inputs_of(clip, setup).items()}
 
 
 def views_of(clip: Clip, setup: Setup) -> list[View]:
@@ -249,7 +241,9 @@ def forecast(perception: Perception, index: int, views: Sequence[View], setup: S
         made[peer.METHOD] = Timed(flat, seconds + ("geometry" in flat.seconds) * looking)
     for name, model in setup.models.items():
         seen = (perception, model, index, setup.steps, views)
-        own, seconds = _timed(functools.partial(network.forecast_frames, *seen, mode=setup.modes[name]))
+        how = setup.later[name]
+        asked_for = functools.partial(network.forecast_frames, *seen, mode=how.mode, perceive=how.perceive)
+        own, seconds = _timed(asked_for)
         made[name] = Timed(own, looking + seconds)
     return made
 

@@ -17,10 +17,10 @@ Source: SPEC section 10. Where a two-frame method stands in a window of 4 + 5 it
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from vestcl.data.cityscapes import open_cityscapes, snippets
 from vestcl.data.kitti_raw import open_kitti_raw
@@ -28,6 +28,8 @@ from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.splits import CONTEXT, FUTURE, KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL
 from vestcl.data.street import Street
+from vestcl.prepared import PreparedClip, find_prepared
+from vestcl.prepared_perception import as_clip
 from vestcl.scoring import RIGHT, SOURCE
 
 Name = Literal[
@@ -74,6 +76,10 @@ class Where:
     """Of a street."""
     samples: int
     """Rays a pixel and direction, of streets."""
+    prepared: Path | None = None
+    """Folder of prepared clips, in place of ``data``."""
+    accumulated_depth: bool = False
+    """Of KITTI raw: depth from `proj_depth/groundtruth`, which has the scans of later frames, too."""
 
     def root(self) -> Path:
         """``data``.
@@ -155,17 +161,23 @@ def currents(frames: int, steps: int, first: int | None, last: int | None = None
 
 def _kitti(drives: tuple[str, ...]) -> Callable[[Where], list[Source]]:
     def sources(where: Where) -> list[Source]:
+        if where.prepared is not None:
+            return _prepared(where, drives)
         paths = [where.root() / drive[: len("2011_09_26")] / drive for drive in drives]
         missing = [path.name for path in paths if not path.is_dir()]
         if missing:
             wanted = "DATE/DATE_drive_NNNN_sync of KITTI raw"
             raise ValueError(f"`data` must have {wanted}, got {where.root()} without {', '.join(missing)}")
-        return [Source(path.name, functools.partial(open_kitti_raw, path)) for path in paths]
+        opens = functools.partial(open_kitti_raw, accumulated_depth=where.accumulated_depth)
+        return [Source(path.name, functools.partial(opens, path)) for path in paths]
 
     return sources
 
 
 def _cityscapes(where: Where) -> list[Source]:
+    _check_unaccumulated(where)
+    if where.prepared is not None:
+        return _prepared(where)
     split = where.root() / "leftImg8bit_sequence" / "val"
     names = snippets(split)
     if not names:
@@ -175,6 +187,10 @@ def _cityscapes(where: Where) -> list[Source]:
 
 
 def _streets(where: Where) -> list[Source]:
+    _check_unaccumulated(where)
+    if where.prepared is not None:
+        return _prepared(where, [f"street {seed}" for seed in where.seeds])
+
     def street(seed: int) -> Clip:
         return Street.generate(seed).clip(where.frames, *where.size, samples=where.samples)
 
@@ -182,8 +198,33 @@ def _streets(where: Where) -> list[Source]:
 
 
 def _sequence(where: Where) -> list[Source]:
-    clip = open_sequence(where.root())
+    if where.prepared is not None:
+        return _prepared(where)
+    options: dict[str, Any] = {"accumulated_depth": True} if where.accumulated_depth else {}
+    clip = open_sequence(where.root(), **options)
     return [Source(clip.name, lambda: clip)]
+
+
+def _check_unaccumulated(where: Where) -> None:
+    if where.accumulated_depth:
+        raise ValueError("`accumulated_depth` is of KITTI raw, whose depth set has maps in proj_depth/groundtruth")
+
+
+def _prepared(where: Where, names: Sequence[str] | None = None) -> list[Source]:
+    """Clips that `vestcl prepare` wrote at the size that is evaluated; those of ``names``, or all."""
+    assert where.prepared is not None
+    found = dict[str, PreparedClip]()
+    for clip in find_prepared(where.prepared):
+        if clip.size == where.size and (names is None or clip.name in names):
+            if other := found.get(clip.name):
+                raise ValueError(f"`prepared` must have one clip of a name, got {other.folder} and {clip.folder}")
+            found[clip.name] = clip
+    missing = [name for name in names or () if name not in found]
+    if missing or not found:
+        wanted = ", ".join(missing) or "a clip"
+        size = f"--height {where.size[0]} --width {where.size[1]}"
+        raise ValueError(f"`prepared` must have {wanted} of `vestcl prepare {size}`, got {where.prepared} without")
+    return [Source(name, functools.partial(as_clip, found[name])) for name in names or found]
 
 
 # ---------------------------------------------------------------- the protocols

@@ -158,8 +158,13 @@ class Forecast:
     mask_model: str | None = None
     """Estimate classes by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
     huggingface.co."""
+    inpaint: str | None = None
+    """How the background behind the foreground is filled: regions, telea ..., or lama:FILE, LaMa's TorchScript export.
+    Without it: regions."""
     rig: str | None = None
     """KITTI: colour or grey cameras."""
+    accumulated_depth: bool = False
+    """KITTI raw: depth from proj_depth/groundtruth, which has the scans of later frames, too."""
     sequence: str | None = None
     """KITTI odometry: which one, if there are several."""
     snippet: str | None = None
@@ -225,8 +230,13 @@ class Prepare:
     mask_model: str | None = None
     """Estimate classes by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
     huggingface.co."""
+    inpaint: str | None = None
+    """How the background behind the foreground is filled: regions, telea ..., or lama:FILE, LaMa's TorchScript export.
+    Without it: regions."""
     rig: str | None = None
     """KITTI: colour or grey cameras."""
+    accumulated_depth: bool = False
+    """KITTI raw: depth from proj_depth/groundtruth, which has the scans of later frames, too."""
     sequence: str | None = None
     """KITTI odometry: which one, if there are several."""
     snippet: str | None = None

@@ -26,6 +26,7 @@ from vestcl.models.trunks import load_trunk
 from vestcl.options import check_pixels
 from vestcl.perceptual import StLpips
 from vestcl.progress import Bar
+from vestcl.scene.inpainters import Inpainter, inpainter
 from vestcl.views import parse_views
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ MOST_STREET_FRAMES: Final = 10_000
 STEPS_SHOWN: Final = 5
 
 #: Options that are passed on to the clip's reader, which knows whether it has them.
-_LAYOUT: Final = ("fov", "rig", "sequence", "snippet", "variant")
+_LAYOUT: Final = ("fov", "rig", "sequence", "snippet", "variant", "accumulated_depth")
 
 #: Options of files beside a clip, with what they are if not given.
 _BESIDE: Final = {"depth": None, "depth_scale": None, "labels": None, "label_ids": "trainIds"}
@@ -88,22 +89,24 @@ def run(options: "cli.Forecast") -> None:
         with stages.stage("open the clip"):
             level = options.quality or quality.USUAL
             model = None if options.model is None else quality.load(options.model, level)
-            estimators = load_estimators(options)
+            estimators = load_estimators(options.depth_model, options.mask_model)
+            inpaint = None if options.inpaint is None else inpainter(options.inpaint, "inpaint")
             clip = open_clip(options, estimators)
-            later = None if model is None else later_frames(model.config, options.mode, options.perceive, *estimators)
+            chosen = options.mode, options.perceive, *estimators, inpaint
+            later = None if model is None else later_frames(model.config, *chosen)
             index = current_frame(clip, options)
             views = parse_views(options.view or ("source",), clip[index])
             forecast_checks.check_memory(options, clip, len(views))
             trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
             st_lpips = None if options.st_lpips is None else StLpips.load(options.st_lpips)
-        forecast = _forecast(clip, index, options, views, stages, model, later)
+        forecast = _forecast(clip, index, options, views, stages, inpaint, model, later)
         stages.seconds |= forecast.seconds
         comparisons = []
         if options.compare:
             with stages.stage("compare") as report:
                 comparisons = compare.compare(forecast, clip, index, views, trunk, report, st_lpips, options.score_size)
                 if model is not None:
-                    rival = _forecast(clip, index, options, views, stages)
+                    rival = _forecast(clip, index, options, views, stages, inpaint)
                     rivals = compare.compare(rival, clip, index, views, trunk, None, st_lpips, options.score_size)
                     comparisons = [_beside(*pair, rival.method) for pair in zip(comparisons, rivals, strict=True)]
         with stages.stage(forecast_files.WRITING) as report:
@@ -135,17 +138,18 @@ def open_clip(options: "cli.Forecast", estimators: Estimators | None = None) -> 
             package or checkpoint is not there.
     """
     forecast_checks.check_input(options.input)
+    estimators = estimators or load_estimators(options.depth_model, options.mask_model)
     street = STREET.fullmatch(options.input)
     beside = {name: getattr(options, name) for name in _BESIDE}
-    layout = {name: getattr(options, name) for name in _LAYOUT if getattr(options, name) is not None}
+    layout = {name: getattr(options, name) for name in _LAYOUT if getattr(options, name) not in (None, False)}
     if street:
         wrong = [*layout, *(name for name, unset in _BESIDE.items() if beside[name] != unset)]
         if wrong:
             raise ValueError(f"{options.input}: is a street, which takes height, width, not {', '.join(wrong)}")
-        return _with_estimates(_street(int(street[1]), options), estimators or load_estimators(options))
+        return with_estimates(_street(int(street[1]), options), estimators)
     forecast_checks.check_folders(options)
     clip = _resized(open_sequence(options.input, **beside, **layout), options.height, options.width)
-    return _with_estimates(clip, estimators or load_estimators(options))
+    return with_estimates(clip, estimators)
 
 
 def current_frame(clip: Clip, options: "cli.Forecast") -> int:
@@ -200,32 +204,32 @@ def _resized(clip: Clip, height: int | None, width: int | None) -> Clip:
     return clip.resized(height, width)
 
 
-def load_estimators(options: "cli.Forecast") -> Estimators:
-    """The estimators that the options name: an existing file is an ONNX network, anything else a checkpoint.
+def load_estimators(depth_model: str | None, mask_model: str | None) -> Estimators:
+    """The estimators that options name: an existing file is an ONNX network, anything else a checkpoint.
 
     Raises:
         ValueError: an estimator whose package, file or checkpoint is missing, or a file that is no network.
     """
-    if options.depth_model is None and options.mask_model is None:
+    if depth_model is None and mask_model is None:
         return Estimators(None, None)
     from vestcl.scene import estimators
 
     depth: DepthOf | None = None
     classes: ClassesOf | None = None
     try:
-        if options.depth_model is not None:
-            is_file = forecast_checks.is_network_file("depth_model", options.depth_model)
-            depth = (estimators.OnnxDepth if is_file else estimators.DepthEstimator).load(options.depth_model)
-        if options.mask_model is not None:
-            is_file = forecast_checks.is_network_file("mask_model", options.mask_model)
-            kind = estimators.OnnxSegmentation if is_file else estimators.SegmentationEstimator
-            classes = kind.load(options.mask_model)
+        if depth_model is not None:
+            is_file = forecast_checks.is_network_file("depth_model", depth_model)
+            depth = (estimators.OnnxDepth if is_file else estimators.DepthEstimator).load(depth_model)
+        if mask_model is not None:
+            is_file = forecast_checks.is_network_file("mask_model", mask_model)
+            classes = (estimators.OnnxSegmentation if is_file else estimators.SegmentationEstimator).load(mask_model)
     except ImportError as error:  # of the optional package; its message names the remedy
         raise ValueError(str(error)) from error
     return Estimators(depth, classes)
 
 
-def _with_estimates(clip: Clip, given: Estimators) -> Clip:
+def with_estimates(clip: Clip, given: Estimators) -> Clip:
+    """The clip with what the estimators give in place of its own depth, its own labels, or both."""
     if given == Estimators(None, None):
         return clip
     from vestcl.scene import estimators
@@ -239,19 +243,21 @@ def _forecast(
     options: "cli.Forecast",
     views: list[View],
     stages: _Stages,
+    inpaint: Inpainter | None = None,
     model: "Forecaster | None" = None,
     later: LaterFrames | None = None,
 ) -> Forecast:
     """By the network, or without one the geometric forecast."""
     stages.show("forecast", 0.0)
     asked = clip, index, options.steps, views
+    how: dict[str, Any] = {} if inpaint is None else {"inpaint": inpaint}
     if model is None or later is None:
         from vestcl import geometric
 
-        return geometric.forecast_clip(*asked, progress=stages.show)
+        return geometric.forecast_clip(*asked, progress=stages.show, **how)
     from vestcl import network
 
-    how: dict[str, Any] = {"mode": later.mode}
+    how["mode"] = later.mode
     if later.perceive is not None:
         how["perceive"] = later.perceive
     return network.forecast_clip(*asked, model, progress=stages.show, **how)

@@ -1,5 +1,6 @@
 """How a network forecasts the frames after the first, as the commands' options choose it."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -8,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.models.config import Mode, ModelConfig
-from vestcl.models.forecaster import Perceive, perceive_estimated
+from vestcl.models.forecaster import Perceive, perceive_estimated, perceive_forecast
+from vestcl.scene.inpainters import Inpainter
 
 Perceived = Literal["splatted", "estimated"]
 """Where the depth and the mask of a forecast frame come from when it is an input of the next step."""
@@ -46,6 +48,7 @@ def later_frames(
     perceived: Perceived | None,
     depth: DepthOf | None = None,
     segmentation: ClassesOf | None = None,
+    inpaint: Inpainter | None = None,
 ) -> LaterFrames:
     """What options mean for a model.
 
@@ -55,6 +58,7 @@ def later_frames(
         perceived: the option; None is "estimated" if there is an estimator, else "splatted".
         depth: the depth estimator, if one was asked for; one whose ``metric`` is False is not used for forecast frames.
         segmentation: the estimator of classes, if one was asked for.
+        inpaint: the method of inpainting, if one was asked for.
 
     Returns:
         The choice.
@@ -73,5 +77,7 @@ def later_frames(
     if perceived == "estimated" and not has_estimator:
         raise ValueError('`perceive` "estimated" needs --depth-model (in metres), --mask-model or both')
     perceived = perceived or ("estimated" if has_estimator else "splatted")
-    perceive = perceive_estimated(depth, segmentation) if perceived == "estimated" else None
+    if perceived == "estimated":
+        return LaterFrames(mode, perceived, perceive_estimated(depth, segmentation, inpaint))
+    perceive = None if inpaint is None else functools.partial(perceive_forecast, inpaint=inpaint)
     return LaterFrames(mode, perceived, perceive)

@@ -16,6 +16,7 @@ from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
 from vestcl.models.skipping import Count, Tally, count_skips
 from vestcl.network_input import NetworkInput, last_motions, network_input
 from vestcl.prepared import prepare_frame
+from vestcl.scene.inpainters import Inpainter
 from vestcl.stages import watching, with_rest
 from vestcl.times import is_same
 
@@ -34,6 +35,7 @@ def forecast_clip(
     *,
     mode: Mode | None = None,
     perceive: Perceive | None = None,
+    inpaint: Inpainter | None = None,
     progress: Progress | None = None,
 ) -> Forecast:
     """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` alone.
@@ -46,6 +48,7 @@ def forecast_clip(
         model: a trained network, see `Forecaster.load`.
         mode: how steps after the first are made, see `Forecaster.forecast`; None is the model's default.
         perceive: how forecast frames become inputs of mode "feedback", see `Forecaster.forecast`.
+        inpaint: how the background behind the foreground of recorded frames is filled, see `Perception`.
         progress: called with the stage and the share of the work that is done.
 
     Returns:
@@ -61,7 +64,7 @@ def forecast_clip(
             progress(stage, min(done[0] / _STAGES, 1.0))
         done[0] += 1
 
-    perception = Perception(clip, tell)
+    perception = Perception(clip, tell, inpaint=inpaint)
     return forecast_frames(perception, model, index, steps, views, mode=mode, perceive=perceive, tell=tell)
 
 

@@ -123,7 +123,7 @@ def _shown(
     depths = [frame[_SOURCE].depth for frame in geometric.frames]
     pairs = zip(images, depths, strict=True)
     forecast = [_sample(clip, index, step, *pair) for step, pair in enumerate(pairs, start=1)]
-    seen = Perception(Clip(clip.name, METHOD, (clip[index - 1], clip[index], *forecast)))
+    seen = Perception(Clip(clip.name, METHOD, (clip[index - 1], clip[index], *forecast)), inpaint=perception.inpaint)
     return [show_frame(seen, step, views) for step in range(2, 2 + len(forecast))]
 
 

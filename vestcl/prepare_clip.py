@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip, Sample
 from vestcl.geometric.perception import Perception
+from vestcl.inputs import Inputs
 from vestcl.io.atomic import read_bytes
 from vestcl.io.images import to_float, to_pixels
 from vestcl.io.video import Video
 from vestcl.prepared import prepare_frame
 from vestcl.prepared_files import JSON, RECIPE, Shape, frame_path, restore_frame, write_clip, write_frame
+from vestcl.scene.inpainters import Inpainter
 
 #: Frames before it that perception looks at: depth from motion sees three, and the frame before has to have it, too.
 LOOKS_BACK: Final = 3
@@ -64,7 +66,14 @@ class EightBitPerception(Perception):
 
 
 def prepare_clip(
-    clip: Clip, folder: Path, *, estimators: str = "", wait: bool = True, report: Report = lambda computed: None
+    clip: Clip,
+    folder: Path,
+    inputs: Inputs | None = None,
+    *,
+    estimators: str = "",
+    inpaint: Inpainter | None = None,
+    wait: bool = True,
+    report: Report = lambda computed: None,
 ) -> Outcome | None:
     """Compute what is missing of a clip's cache; afterwards it is complete.
 
@@ -75,7 +84,9 @@ def prepare_clip(
     Args:
         clip: at the size wanted, two frames or more.
         folder: for this clip alone.
-        estimators: what tells the networks apart that estimate depth or classes for the clip.
+        inputs: where depth, masks, camera motion and inpainting come from, for clip.json; None reads it off the clip.
+        estimators: what tells the networks apart that estimate depth or classes for the clip, or inpaint.
+        inpaint: how the background is filled, see `vestcl.geometric.Perception`.
         wait: for another process that is at this clip.
         report: called after each frame.
 
@@ -89,11 +100,17 @@ def prepare_clip(
     if len(clip) < 2:
         raise ValueError(f"{clip.name}: must have 2 frames or more, got 1: without a motion nothing is forecast")
     with _locked(folder, wait) as ours:
-        return _complete(clip, folder, estimators, report) if ours else None
+        if not ours:
+            return None
+        outcome, keys = _complete(EightBitPerception(clip, inpaint=inpaint), folder, estimators, report)
+        with _explained(folder / JSON):
+            write_clip(folder, clip, keys, inputs)
+        return outcome
 
 
-def _complete(clip: Clip, folder: Path, estimators: str, report: Report) -> Outcome:
-    start = time.perf_counter()
+def _complete(perception: Perception, folder: Path, estimators: str, report: Report) -> tuple[Outcome, list[str]]:
+    """Write what is missing; returns what was done, and the frames' keys."""
+    clip, start = perception.clip, time.perf_counter()
     keys = frame_keys(clip, estimators)
     missing = {index for index, key in enumerate(keys) if not _is_there(clip, folder, index, key)}
     seconds = Counter({"check": time.perf_counter() - start})
@@ -103,14 +120,11 @@ def _complete(clip: Clip, folder: Path, estimators: str, report: Report) -> Outc
         if not path.is_file():  # a file is replaced in one step, a folder can't be
             _remove(path)
     _tidy(folder, len(clip))
-    perception = EightBitPerception(clip)
     for index, key in enumerate(keys):
         if index in missing:
             seconds.update(_write(perception, folder, index, key))
         report(index in missing)
-    with _explained(folder / JSON):
-        write_clip(folder, clip, keys)
-    return Outcome(len(missing), len(clip) - len(missing), {**perception.seconds, **seconds})
+    return Outcome(len(missing), len(clip) - len(missing), {**perception.seconds, **seconds}), keys
 
 
 def _write(perception: Perception, folder: Path, index: int, key: str) -> dict[str, float]:
@@ -192,18 +206,19 @@ def frame_keys(clip: Clip, estimators: str = "") -> list[str]:
 
     Args:
         clip: at the size wanted.
-        estimators: what tells the networks apart that estimate depth or classes.
+        estimators: what tells the networks apart that estimate depth or classes, or inpaint.
 
     Raises:
         ValueError: a file is missing.
     """
     samples = [_sample_digest(sample) for sample in clip]
+    some = len({sample.labels is None for sample in clip}) > 1  # then they make no mask, as they once did
     keys = []
     for index in range(len(clip)):
         # The first frame has none before it, so that its depth may be from its motion to the second.
         first = max(index - LOOKS_BACK, 0)
         seen = samples[:2] if index == 0 else samples[first : index + 1]
-        key = hashlib.sha256(f"{RECIPE}|{index == 0}|{estimators}".encode())
+        key = hashlib.sha256(f"{RECIPE}|{index == 0}|{estimators}{'|masks from motion' * some}".encode())
         elapsed = [clip.elapsed(before) for before in range(first, index + 1)]
         if set(elapsed) != {1.0}:  # velocities are per interval, and long gaps are not matched
             key.update(f"|{elapsed} intervals".encode())

@@ -20,9 +20,11 @@ from vestcl.data.street import Street
 from vestcl.data.street_drive import Sway
 from vestcl.forecast_checks import check_file_options, is_network_file
 from vestcl.forecast_command import open_clip
+from vestcl.inputs import inputs_of
 from vestcl.prepare_clip import Outcome, Report, prepare_clip
 from vestcl.prepare_workers import Task, Told, run_tasks
 from vestcl.progress import Bar
+from vestcl.scene.inpainters import LAMA, inpainter
 
 if TYPE_CHECKING:
     from vestcl import cli
@@ -50,6 +52,7 @@ _READER: Final[Mapping[str, Any]] = {
     **dict.fromkeys(("fov", "depth", "depth_scale", "labels", "depth_model", "mask_model")),
     **dict.fromkeys(("rig", "sequence", "snippet", "variant")),
     "label_ids": "trainIds",
+    "accumulated_depth": False,
 }
 
 
@@ -194,15 +197,24 @@ def _cache(text: str, options: "cli.Prepare") -> Path:
 
 
 def estimators(options: "cli.Prepare") -> str:
-    """A key of the networks that the options name: hub names, or a network's files, their sizes and times."""
-    told = []
-    for model in (options.depth_model, options.mask_model):
+    """What tells the networks apart that the options name; nothing without any."""
+    models = (options.depth_model, options.mask_model, *((options.inpaint,) if options.inpaint else ()))
+    told = [*map(identity, models), *([COMBINED] if options.depth_model else [])]
+    return "|".join(told) if any(models) else ""
+
+
+def identity(model: str | None) -> str:
+    """What tells a network apart: its name on the hub, or its files with their sizes and times.
+
+    Args:
+        model: a folder, a file, "lama:FILE" or a name.
+    """
+    if model and model.startswith(LAMA):
+        files = [path] if (path := Path(model.removeprefix(LAMA))).is_file() else []
+    else:
         files = _files_of(Path(model)) if model else []
-        about = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
-        told.append(repr(about) if about else repr(model))
-    if options.depth_model:
-        told.append(COMBINED)
-    return "|".join(told) if any((options.depth_model, options.mask_model)) else ""
+    about = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    return repr(about) if about else repr(model)
 
 
 def _files_of(model: Path) -> list[Path]:
@@ -215,8 +227,12 @@ def _files_of(model: Path) -> list[Path]:
 
 
 def _prepare(task: Task, waits: bool, report: Report, options: "cli.Prepare") -> Outcome | None:
-    clip = open_input(task.text, options)
-    return prepare_clip(clip, task.folder, estimators=estimators(options), wait=waits, report=report)
+    clip, inpaint = open_input(task.text, options), None
+    if options.inpaint is not None:
+        inpaint = inpainter(options.inpaint, "inpaint")
+    inputs = inputs_of(clip, depth_model=options.depth_model, mask_model=options.mask_model, inpaint=options.inpaint)
+    key = estimators(options)
+    return prepare_clip(clip, task.folder, inputs, estimators=key, inpaint=inpaint, wait=waits, report=report)
 
 
 def _print_end(console: Console, told: Told, tasks: Sequence[Task], which: str) -> None:

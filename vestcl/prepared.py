@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from vestcl import times
 from vestcl.geometric.perception import Perception
+from vestcl.inputs import Inputs
 from vestcl.prepared_files import ALWAYS, DAMAGE, JSON, damaged, frame_path, read_clip, read_tensors
 from vestcl.scene.layers import Layers
 
@@ -80,6 +81,8 @@ class PreparedClip:
     frames: tuple[_Frame, ...]
     positions: NDArray[np.float64]
     """[frames] times in intervals since the first frame, see `vestcl.data.sample.Clip.positions`."""
+    inputs: Inputs | None = None
+    """Where depth, masks, camera motion and inpainting come from; None in caches of former versions."""
 
     @classmethod
     def open(cls, folder: Path | str) -> "PreparedClip":
@@ -97,7 +100,8 @@ class PreparedClip:
             frames = tuple(map(_frame, about["frames"]))
             height, width = map(int, about["size"])
             interval, positions = _times(about["frames"], about["fps"])
-            return cls(folder, about["name"], about["kind"], interval, (height, width), frames, positions)
+            inputs = Inputs.read(about["inputs"]) if "inputs" in about else None
+            return cls(folder, about["name"], about["kind"], interval, (height, width), frames, positions, inputs)
         except DAMAGE as error:
             raise damaged(folder / JSON, error) from error
 
@@ -142,6 +146,13 @@ class PreparedClip:
             ValueError: no such frame, or its file is missing or damaged.
         """
         return _to_float(self._read(index, "image")["image"])
+
+    def right_camera(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[int, int]] | None:
+        """The right camera's K [3, 3] px, right_from_left [4, 4] m and (height, width) px; None if there is none."""
+        known = self._frame(index)
+        if known.right is None:
+            return None
+        return known.right[0].copy(), known.right[1].copy(), known.right_size or self.size
 
     def right(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]] | None:
         """The right camera's image [3, H, W], its K [3, 3] px and right_from_left [4, 4] m; None if there is none.

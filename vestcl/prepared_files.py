@@ -11,7 +11,8 @@ A frame's file holds, with n pixels where M = 0 and m pixels that move beside th
 
 right and prev_from_cur are left out where there is none. Its metadata hold the key of what it was computed
 from (vestcl/prepare_clip.py) and a CRC-32 of every tensor; names, types and shapes are checked against this table.
-clip.json holds a CRC-32 of its other entries.
+clip.json holds a CRC-32 of its other entries, among them where depth, masks, camera motion and inpainting come from
+("inputs"; files of former versions have none).
 """
 
 import json
@@ -26,6 +27,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from vestcl.data.sample import Clip, Sample
+from vestcl.inputs import Inputs, inputs_of
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.io.images import to_pixels
 
@@ -52,6 +54,7 @@ _ANY: Final = -1
 
 #: Of clip.json: the CRC-32 of its other entries. Files of vestcl 0.3 and before have these entries and no checksum.
 _CHECKSUM: Final = "checksum"
+_INPUTS: Final = "inputs"
 _UNCHECKED: Final = frozenset(("recipe", "name", "kind", "fps", "size", "frames"))
 
 #: What reading a damaged file raises: I/O, JSON and safetensors, and entries that are absent or of another type.
@@ -85,20 +88,22 @@ def write_frame(folder: Path, index: int, key: str, frame: "Prepared", right: ND
     write_bytes(frame_path(folder, index), _encoded(key, _packed(frame, right)))
 
 
-def write_clip(folder: Path, clip: Clip, keys: Sequence[str]) -> None:
+def write_clip(folder: Path, clip: Clip, keys: Sequence[str], inputs: Inputs | None = None) -> None:
     """Write clip.json, which completes a folder of frames.
 
     Args:
         folder: with a file for every frame.
         clip: at the size it was prepared at.
         keys: of its frames.
+        inputs: of its frames; None reads them off the clip.
 
     Raises:
         OSError: it can't be written.
     """
     frames = [_facts(sample, key) for sample, key in zip(clip, keys, strict=True)]
     size = [clip[0].height, clip[0].width]
-    about = {"recipe": RECIPE, "name": clip.name, "kind": clip.kind, "fps": clip.fps, "size": size, "frames": frames}
+    listed = {"size": size, "frames": frames, _INPUTS: (inputs or inputs_of(clip)).as_entries()}
+    about = {"recipe": RECIPE, "name": clip.name, "kind": clip.kind, "fps": clip.fps, **listed}
     whole = about | {_CHECKSUM: _checksum(about)}
     write_bytes(folder / JSON, (json.dumps(whole, allow_nan=False) + "\n").encode())
 
@@ -139,7 +144,7 @@ def damaged(path: Path, error: BaseException | str) -> ValueError:
 def _check_entries(about: dict[str, Any]) -> None:
     """Removes the checksum and compares it; a file without one must have the entries of former versions."""
     if _CHECKSUM not in about:
-        if about.keys() != _UNCHECKED:
+        if about.keys() - {_INPUTS} != _UNCHECKED:
             raise ValueError("no checksum")
     elif about.pop(_CHECKSUM) != _checksum(about):
         raise ValueError("the checksum")

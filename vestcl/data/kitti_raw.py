@@ -32,6 +32,9 @@ OXTS_NUMBERS: Final = 30
 #: A laser's return is farther from the camera than this, metres.
 NEAREST: Final = 0.01
 
+#: Where KITTI's depth set has its depth maps, above the cameras' folders.
+ACCUMULATED: Final = ("proj_depth", "groundtruth")
+
 Rig = Literal["colour", "grey"]
 """Which stereo pair: cameras 2 and 3, or 0 and 1."""
 
@@ -72,20 +75,24 @@ class VelodyneScan:
         return np.where(np.isfinite(depth), depth, np.float32(0))
 
 
-def open_kitti_raw(path: str | Path, rig: Rig = "colour", first_pose_identity: bool = True) -> Clip:
+def open_kitti_raw(
+    path: str | Path, rig: Rig = "colour", first_pose_identity: bool = True, accumulated_depth: bool = False
+) -> Clip:
     """A drive: left camera, right camera, poses, and depth where there is any.
 
-    Depth comes from `proj_depth/groundtruth/image_0i` of KITTI's depth set where that lies in the drive, else from
-    `velodyne_points`, else there is none (the pair gives it).
+    Depth comes from `velodyne_points`, else there is none (the pair gives it). The maps of KITTI's depth set,
+    `proj_depth/groundtruth/image_0i`, are accumulated from the scans of 11 frames, five of them later ones: no camera
+    has them at time t, so that they are read only where they are asked for.
 
     Args:
         path: DATE/DATE_drive_NNNN_sync, with the date's calibration files beside it.
         rig: the colour or the grey cameras.
         first_pose_identity: the world is the first camera; otherwise the Mercator plane, far from its origin.
+        accumulated_depth: depth comes from `proj_depth/groundtruth`, of the frames that have a map there.
 
     Raises:
-        ValueError: a file is missing or malformed, or the images can't be of the rectified cameras; the message
-            names it.
+        ValueError: a file is missing or malformed, no accumulated depth where it is asked for, or the images can't be
+            of the rectified cameras; the message names it.
 
     Source: SPEC section 9; devkit of KITTI raw (Geiger et al., IJRR 2013).
     """
@@ -101,7 +108,10 @@ def open_kitti_raw(path: str | Path, rig: Rig = "colour", first_pose_identity: b
     K, cam_from_rect0 = _camera(drive, left, size, cameras)
     poses = _poses(drive, list(frames), cam_from_rect0, cameras)
     seconds = _times(drive / f"image_{left:02}" / "timestamps.txt", list(frames))
-    depths = _depths(drive, left, K, cam_from_rect0, size, cameras, list(frames))
+    numbers = list(frames)
+    depths = (
+        _maps(drive, left, numbers) if accumulated_depth else _scans(drive, K, cam_from_rect0, size, cameras, numbers)
+    )
     rights = _rights(drive, right, cam_from_rect0, cameras, list(frames))
     samples = []
     for (number, frame), time, pose in zip(frames.items(), seconds, poses, strict=True):
@@ -217,20 +227,19 @@ def _moments(path: Path, frames: list[int]) -> list[datetime]:
     return [moment(frame + 1) for frame in frames]
 
 
-def _depths(
-    drive: Path,
-    left: int,
-    K: Matrix,
-    cam_from_rect0: Matrix,
-    size: tuple[int, int],
-    cameras: Calibration,
-    numbers: list[int],
-) -> dict[int, DepthSource]:
-    """By frame: KITTI's depth maps where there are any, else the laser scans."""
-    folder = drive / "proj_depth" / "groundtruth" / f"image_{left:02}"
+def _maps(drive: Path, left: int, numbers: list[int]) -> dict[int, DepthSource]:
+    """By frame, KITTI's accumulated depth maps."""
+    folder = drive.joinpath(*ACCUMULATED, f"image_{left:02}")
     maps = files.numbered_next_to(folder, numbers, (".png",))
-    if maps:
-        return {number: DepthFile(path, KITTI_UNITS) for number, path in maps.items()}
+    if not maps:
+        raise ValueError(f"`accumulated_depth` needs KITTI's depth maps, and {folder} has none")
+    return {number: DepthFile(path, KITTI_UNITS) for number, path in maps.items()}
+
+
+def _scans(
+    drive: Path, K: Matrix, cam_from_rect0: Matrix, size: tuple[int, int], cameras: Calibration, numbers: list[int]
+) -> dict[int, DepthSource]:
+    """By frame, the laser scans."""
     scans = files.numbered_next_to(drive / "velodyne_points" / "data", numbers, (".bin",))
     if not scans:
         return {}

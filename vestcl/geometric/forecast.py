@@ -16,6 +16,7 @@ from vestcl.geometric.paths import Paths, forecast_cameras, point_paths
 from vestcl.geometric.perception import Perception
 from vestcl.geometric.render import Cloud, Shown, holes, rendered, show
 from vestcl.scene.holes import deep_holes, fill_holes
+from vestcl.scene.inpainters import Inpainter
 
 #: The name of this method in tables and files.
 METHOD: Final = "geometric"
@@ -24,7 +25,13 @@ Progress = Callable[[str, float], None]
 
 
 def forecast_clip(
-    clip: Clip, index: int, steps: int, views: Sequence[View], *, progress: Progress | None = None
+    clip: Clip,
+    index: int,
+    steps: int,
+    views: Sequence[View],
+    *,
+    inpaint: Inpainter | None = None,
+    progress: Progress | None = None,
 ) -> Forecast:
     """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` alone.
 
@@ -33,6 +40,7 @@ def forecast_clip(
         index: the current frame t, 1 or more.
         steps: frames to forecast, 1 or more.
         views: cameras to show each from.
+        inpaint: how the background behind the foreground is filled, see `Perception`.
         progress: called with the stage and the share of the work that is done.
 
     Returns:
@@ -48,7 +56,7 @@ def forecast_clip(
             progress(stage, min(done[0] / total, 1.0))
         done[0] += 1
 
-    return forecast_frames(Perception(clip, tell), index, steps, views, tell=tell)
+    return forecast_frames(Perception(clip, tell, inpaint=inpaint), index, steps, views, tell=tell)
 
 
 def _stages(index: int) -> int:

@@ -20,6 +20,8 @@ from vestcl.scene.correspondence import Correspondence, correspond
 from vestcl.scene.depth import CombinedDepth, combine_depth
 from vestcl.scene.ego_motion import ego_motion
 from vestcl.scene.estimators.sources import EstimatedFrame
+from vestcl.scene.inpaint import DEFAULT
+from vestcl.scene.inpainters import Inpainter, inpainter
 from vestcl.scene.layers import Layers, build_layers
 from vestcl.scene.lidar import densify
 from vestcl.scene.motion import backtest
@@ -70,14 +72,32 @@ class Perception:
     `Perception`; one computes at a time.
 
     ``seconds`` tells the time by stage. Depth comes from the clip (scans are densified), else from its stereo pair,
-    else from motion; a network's depth of a clip without a stereo pair is combined with motion's (`combine_depth`).
-    Masks come from labels, else from motion. A depth map without a valid pixel is as a missing one, and
-    is logged. Across a gap in time that is too long to match the frames on both sides of it, the camera moves on at the
+    else from motion; a network's depth of a clip without a stereo pair is combined with motion's (`combine_depth`). A
+    depth map without a valid pixel is as a missing one, and is logged. Masks are from labels where every frame has
+    them, else all from motion: frames t - 1 and t must have theirs from one source, and Cityscapes labels one frame of
+    30. Across a gap in time that is too long to match the frames on both sides of it, the camera moves on at the
     velocity before, and depth from motion is that of a level road; see `is_lost`.
+
+    Args:
+        clip: at its own size.
+        progress: called with the stage that begins.
+        inpaint: how the background behind the foreground is filled, as `vestcl.scene.inpaint.inpaint_background` takes
+            it; None is its default.
+
+    Raises:
+        ValueError: no such method of inpainting.
     """
 
-    def __init__(self, clip: Clip, progress: Callable[[str], None] | None = None) -> None:
+    def __init__(
+        self,
+        clip: Clip,
+        progress: Callable[[str], None] | None = None,
+        *,
+        inpaint: str | Inpainter | None = None,
+    ) -> None:
         self.clip = clip
+        self.inpaint = inpainter(DEFAULT if inpaint is None else inpaint)
+        self.has_labels = all(sample.labels is not None for sample in clip)
         self.seconds: dict[str, float] = {}
         self._progress = progress
         self._kept: dict[tuple[str, int], Any] = {}
@@ -246,14 +266,14 @@ class Perception:
             return self._from_motion(index).prev_from_cur
         sample = self.clip[index]
         static = ~sample.read_ego_vehicle()
-        if sample.labels is not None:
+        if self.has_labels:
             static &= sample.read_mask()
         found = ego_motion(self.raw_depth(index), static, self.correspondence(index), sample.K)
         return found.dst_from_src
 
     def _mask(self, index: int) -> NDArray[np.bool_]:
         sample = self.clip[index]
-        if sample.labels is not None:
+        if self.has_labels:
             return background(sample.read_labels())
         if index == 0:
             return np.ones((1, sample.height, sample.width), bool)
@@ -262,7 +282,7 @@ class Perception:
 
     def _sky(self, index: int, depth: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:
         sample = self.clip[index]
-        return sample.read_labels() == SKY if sample.labels is not None else sky_mask(self.image(index), depth)
+        return sample.read_labels() == SKY if self.has_labels else sky_mask(self.image(index), depth)
 
     def _see(self, index: int) -> Seen:
         sample, mask, depth = self.clip[index], self.mask(index), self.raw_depth(index)
@@ -270,7 +290,7 @@ class Perception:
         if index > 0 and not self._is_monocular(index):
             view = View(self.correspondence(index), self.prev_from_cur(index))
             depth = refine_depth(depth, self.inverse_std(index), sample.K, [view], mask & ~own)
-        layers = build_layers(self.image(index), depth, mask, sky=self._sky(index, depth))
+        layers = build_layers(self.image(index), depth, mask, sky=self._sky(index, depth), inpaint=self.inpaint)
         things = objects.segment(mask, layers.depth)
         velocity = np.zeros_like(layers.image)
         if index > 0:

@@ -14,6 +14,7 @@ from vestcl.models._frames import FOREGROUND_BELOW
 from vestcl.models._render import Camera, RenderedView
 from vestcl.scene import layers
 from vestcl.scene.estimators.sources import CheckedClasses, CheckedDepth
+from vestcl.scene.inpainters import Inpainter
 from vestcl.scene.layers import SKY_DEPTH, LayerBatch
 
 #: image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W] of 0 and 1 -> their layers.
@@ -23,13 +24,16 @@ Perceive = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], LayerBatch]
 _SKY_FROM: Final = SKY_DEPTH / 2
 
 
-def perceive_forecast(image: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor) -> LayerBatch:
+def perceive_forecast(
+    image: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor, inpaint: Inpainter | None = None
+) -> LayerBatch:
     """The layers of forecast frames: unknown depths from the nearest pixel that has one, then inpainting.
 
     Args:
         image: [B, 3, H, W] in [0, 1].
         depth: [B, 1, H, W] m; 0 = unknown.
         mask: [B, 1, H, W], 1 on the static background.
+        inpaint: how the background is filled, see `vestcl.scene.layers.build_layers`.
 
     Returns:
         Their layers; no gradient.
@@ -37,12 +41,13 @@ def perceive_forecast(image: torch.Tensor, depth: torch.Tensor, mask: torch.Tens
     Raises:
         ValueError: a frame without any known depth.
     """
-    return _of_frames(_layers, image, depth, mask)
+    return _of_frames(functools.partial(_layers, inpaint), image, depth, mask)
 
 
 def perceive_estimated(
     depth: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
     segmentation: Callable[[NDArray[np.float32]], NDArray[np.uint8]] | None = None,
+    inpaint: Inpainter | None = None,
 ) -> Perceive:
     """Layers of forecast frames by the estimators that see recorded frames: of depth, of classes, or of both.
 
@@ -51,6 +56,7 @@ def perceive_estimated(
             function; None keeps the splatted depth.
         segmentation: [3, H, W] -> [1, H, W] uint8 train ids: a `SegmentationEstimator` or any function; None keeps the
             splatted mask, and takes what is splatted from far away for sky.
+        inpaint: how the background is filled, see `vestcl.scene.layers.build_layers`.
 
     Returns:
         What `vestcl.models.forecaster.Forecaster.forecast` takes for ``perceive``; it raises a ValueError where an
@@ -69,7 +75,7 @@ def perceive_estimated(
             mask, sky = background(ids), (ids == SKY) | (far & (depth_of is None))
         if depth_of is not None:
             metres = depth_of(image)
-        return layers.build_layers(image, metres, mask >= FOREGROUND_BELOW, sky=sky)
+        return layers.build_layers(image, metres, mask >= FOREGROUND_BELOW, sky=sky, inpaint=inpaint)
 
     return functools.partial(_of_frames, layers_of)
 
@@ -99,9 +105,9 @@ def _of_frames(
     return layers.batch([layers_of(*frame) for frame in frames])
 
 
-def _layers(image: NDArray[Any], depth: NDArray[Any], mask: NDArray[Any]) -> layers.Layers:
+def _layers(inpaint: Inpainter | None, image: NDArray[Any], depth: NDArray[Any], mask: NDArray[Any]) -> layers.Layers:
     filled = _filled(depth)
-    return layers.build_layers(image, filled, mask >= FOREGROUND_BELOW, sky=filled >= _SKY_FROM)
+    return layers.build_layers(image, filled, mask >= FOREGROUND_BELOW, sky=filled >= _SKY_FROM, inpaint=inpaint)
 
 
 def _filled(depth: NDArray[Any]) -> NDArray[Any]:

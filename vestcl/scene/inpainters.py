@@ -122,6 +122,9 @@ class Lama:
         return filled[0, :, : colour.shape[1], : colour.shape[2]].clamp(0, 1).numpy()
 
 
+#: What begins the name of LaMa with its file.
+LAMA: Final = "lama:"
+
 #: By name; "lama:PATH" is one more.
 METHODS: Final[Mapping[str, Inpainter]] = MappingProxyType(
     {
@@ -135,18 +138,22 @@ METHODS: Final[Mapping[str, Inpainter]] = MappingProxyType(
 )
 
 
-def inpainter(method: str | Inpainter) -> Inpainter:
+def inpainter(method: str | Inpainter, argument: str = "method") -> Inpainter:
     """A method by name, or itself.
+
+    Args:
+        method: a name of METHODS, "lama:PATH", or a function.
+        argument: what messages call it.
 
     Raises:
         ValueError: no such name, or LaMa's file can't be loaded.
     """
     if not isinstance(method, str):
         return method
-    if method.startswith("lama:"):
-        return Lama(method.removeprefix("lama:"))
+    if method.startswith(LAMA):
+        return Lama(method.removeprefix(LAMA))
     if method not in METHODS:
-        raise ValueError(f"`method` must be one of {', '.join(METHODS)} or lama:PATH, got {method!r}")
+        raise ValueError(f"`{argument}` must be one of {', '.join(METHODS)} or lama:PATH, got {method!r}")
     return METHODS[method]
 
 

@@ -1,0 +1,81 @@
+"""What the scores of an evaluation depend on, as results.json lists it, and the key that names its parts by it."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any, Final
+
+from train.evaluate_options import Evaluation
+from train.evaluate_windows import PART_WINDOWS
+from train.protocols import Protocol
+from vestcl import __version__, st_lpips
+from vestcl.prepare_command import identity
+from vestcl.prepared_files import JSON
+
+#: Settings that scores do not depend on, or that stand in the key as the content of files.
+_NOT_IN_KEY: Final = (
+    "model",
+    "squeeze",
+    "lpips",
+    "st_lpips",
+    "peer",
+    "out",
+    "shard",
+    "merge",
+    "device",
+    "horizons",
+    "sheets",
+)
+
+#: Of the scores' files: raised when what a window is given or how it is scored changes.
+_SCORING: Final = 3
+
+
+def about_run(config: Evaluation, protocol: Protocol) -> dict[str, Any]:
+    """What the scores depend on, for JSON.
+
+    Args:
+        config: of the evaluation.
+        protocol: as the options change it.
+
+    Raises:
+        FileNotFoundError: no such model or weights.
+    """
+    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_IN_KEY}
+    folders = {name: getattr(config, name) for name in ("data", "prepared")}
+    changed = {name: None if folder is None else str(folder.resolve()) for name, folder in folders.items()}
+    effective = {k: getattr(protocol, k) for k in ("size", "steps", "first", "last")}
+    weights = {"squeeze": config.squeeze} | dict(zip(("alexnet", "lpips"), config.lpips or (), strict=False))
+    weights |= {"peer": config.peer, "st_lpips": config.st_lpips and st_lpips.find_weights(config.st_lpips)}
+    hashes = {name: _sha256(path) for name, path in weights.items() if path is not None}
+    models = {name: getattr(config, name) for name in ("depth_model", "mask_model", "inpaint")}
+    hashes |= {name: _digest(identity(model).encode()) for name, model in models.items() if model is not None}
+    if config.prepared is not None:
+        hashes["prepared"] = _digest(*(path.read_bytes() for path in sorted(config.prepared.rglob(JSON))))
+    return {
+        "vestcl": __version__,
+        "settings": settings | changed | effective,
+        "models": {path.stem: {"file": str(path), "sha256": _sha256(path)} for path in config.model},
+        "weights": hashes,
+    }
+
+
+def key_of(about: dict[str, Any]) -> str:
+    """12 hexadecimal digits of what `about_run` gave, wherever the models' files lie."""
+    hashes = {name: model["sha256"] for name, model in about["models"].items()}
+    content = json.dumps(
+        about | {"models": hashes, "part": PART_WINDOWS, "scoring": _SCORING}, sort_keys=True, default=str
+    )
+    return _digest(content.encode())[:12]
+
+
+def _digest(*content: bytes) -> str:
+    digest = hashlib.sha256()
+    for part in content:
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def _sha256(path: Path) -> str:
+    return _digest(path.read_bytes())

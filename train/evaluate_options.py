@@ -1,0 +1,98 @@
+"""What `python -m train.evaluate --help` lists."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from train.protocols import HELD_OUT, Name
+from vestcl.later_frames import Perceived
+from vestcl.models.forecaster import Mode
+from vestcl.st_lpips import Option as StLpipsOption
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Score models and baselines on every window of a protocol."""
+
+    protocol: tyro.conf.Positional[Name]
+    """Which clips, windows, cameras and size."""
+    model: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """A model's file, *.safetensors; more than one may be told. Tables call it by the file's stem."""
+    data: Path | None = None
+    """The data set's root, or for `clip` what `vestcl forecast` opens. `street` needs none."""
+    prepared: Path | None = None
+    """In place of --data: a folder of clips that `vestcl prepare` wrote at the size that is evaluated, by the names of
+    the protocol's clips; for `clip` all that it has."""
+    out: Path | None = None
+    """Folder for results and for what is done so far; without it out/PROTOCOL."""
+    squeeze: Path | None = None
+    """SqueezeNet 1.0 weights, for the distance in its features."""
+    lpips: tuple[Path, Path] | None = None
+    """Weights of AlexNet (torchvision) and of LPIPS's heads (v0.1)."""
+    st_lpips: StLpipsOption = None
+    """Measure ST-LPIPS, by the weights FILE or those inside an installed stlpips-pytorch."""
+    peer: Path | None = None
+    """Weights of the learned 2D baseline (`python -m train.peer` writes peer.safetensors)."""
+    height: int | None = None
+    """Pixels; without it the protocol's."""
+    width: int | None = None
+    """Pixels; without it the protocol's."""
+    steps: int | None = None
+    """Frames to forecast; without it the protocol's."""
+    horizons: tuple[int, ...] = ()
+    """Steps that tables show; without it the protocol's."""
+    every: int = 1
+    """Take every such window."""
+    first: int | None = None
+    """The first current frame t of a clip, from 0; without it the protocol's."""
+    last: int | None = None
+    """The last one."""
+    mode: Mode | None = None
+    """How models make steps after the first: compose the first motion, or feed each forecast frame back (feedback).
+    Without it each as it is meant to: feedback for models that start from rest, compose for vest-s."""
+    perceive: Perceived | None = None
+    """With mode feedback: depth and mask of forecast frames are splatted, or estimated by --depth-model and
+    --mask-model. Without it: estimated where one of these is given, else splatted."""
+    depth_model: str | None = None
+    """Estimate depth by this checkpoint (a folder, or a name on huggingface.co)."""
+    mask_model: str | None = None
+    """Estimate classes by this checkpoint (a folder, or a name on huggingface.co)."""
+    inpaint: str | None = None
+    """How the background behind the foreground is filled: regions, telea ..., or lama:FILE, LaMa's TorchScript export.
+    Without it: regions."""
+    accumulated_depth: bool = False
+    """KITTI raw: depth from proj_depth/groundtruth, which has the scans of later frames, too. Tables say so."""
+    stereo: bool = False
+    """Take depth from stereo pairs even where clips have depth (laser scans, or a street's true depth). Rows that do
+    end in "stereo pair"; where the right camera's future is judged they come next to monocular ones."""
+    seeds: tuple[int, int] = (HELD_OUT[0], HELD_OUT[-1])
+    """Of streets: the first and the last."""
+    samples: int = 2
+    """Rays a pixel and direction, of streets."""
+    shard: str | None = None
+    """I/N, 0 <= I < N: do this share of the windows. Without it RANK and WORLD_SIZE tell, as torchrun sets them."""
+    merge: bool = False
+    """Forecast nothing: make the tables of what is done, which must be everything."""
+    sheets: bool = True
+    """Write contact sheets of the best, the median and the worst window."""
+    device: str | None = None
+    """OpenCL device: an index of `vestcl devices` or a part of its name."""
+
+
+def check_options(config: Evaluation) -> None:
+    """Refuse inputs that exclude each other.
+
+    Raises:
+        ValueError: the message names both.
+    """
+    if config.prepared is None:
+        return
+    for name in ("data", "stereo", "accumulated_depth"):
+        if getattr(config, name):
+            raise ValueError(f"`{name}` must not be given with `prepared`, whose clips have images and depth")
+    if config.perceive != "estimated" and (config.depth_model or config.mask_model):
+        raise ValueError(
+            "`prepared` clips have depth and masks: `depth_model` and `mask_model` are of forecast frames then, and "
+            "need --perceive estimated"
+        )

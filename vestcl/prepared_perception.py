@@ -1,0 +1,117 @@
+"""Prepared clips in place of recorded ones: their frames as a clip, and what was computed of them as a perception."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vestcl.data.sample import Clip, RightCamera, Sample
+from vestcl.geometric import objects
+from vestcl.geometric.perception import Perception, Seen
+from vestcl.prepared import Prepared, PreparedClip
+from vestcl.scene.inpainters import Inpainter
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedImage:
+    """A prepared frame's image, or that of its right camera."""
+
+    clip: PreparedClip
+    index: int
+    height: int
+    width: int
+    is_right: bool = False
+
+    def read(self) -> NDArray[np.float32]:
+        """[3, H, W] RGB in [0, 1], 8 bits.
+
+        Raises:
+            ValueError: the frame's file is missing or damaged.
+        """
+        if not self.is_right:
+            return self.clip.image(self.index)
+        camera = self.clip.right(self.index)
+        assert camera is not None
+        return camera[0]
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedSequence(Clip):
+    """A prepared clip's images, cameras, poses and times as a clip; it has no depth and no labels of its own."""
+
+    prepared: PreparedClip | None = None
+    """What it was made of."""
+
+
+def as_clip(prepared: PreparedClip) -> PreparedSequence:
+    """The frames, at the size that they were prepared at.
+
+    Args:
+        prepared: of `vestcl prepare`.
+
+    Raises:
+        ValueError: a frame's file is missing or damaged.
+    """
+    samples = tuple(_sample(prepared, index) for index in range(len(prepared)))
+    return PreparedSequence(prepared.name, prepared.kind, samples, prepared)
+
+
+def _sample(prepared: PreparedClip, index: int) -> Sample:
+    interval = prepared.interval
+    return Sample(
+        prepared.frame_name(index),
+        PreparedImage(prepared, index, *prepared.size),
+        prepared.K(index),
+        timestamp=None if interval is None else float(prepared.positions[index]) * interval,
+        world_from_cam=prepared.world_from_cam(index),
+        right=_right(prepared, index),
+    )
+
+
+def _right(prepared: PreparedClip, index: int) -> RightCamera | None:
+    camera = prepared.right_camera(index)
+    if camera is None:
+        return None
+    K, right_from_left, size = camera
+    return RightCamera(PreparedImage(prepared, index, *size, is_right=True), K, right_from_left)
+
+
+class PreparedPerception(Perception):
+    """What `vestcl prepare` computed of a clip; flow, and each point's velocity from it, are computed here.
+
+    Args:
+        clip: of `as_clip`, at its own size.
+        inpaint: see `Perception`; of frames that are computed from this one's, by `vestcl.peer` for one.
+    """
+
+    def __init__(self, clip: PreparedSequence, *, inpaint: Inpainter | None = None) -> None:
+        super().__init__(clip, inpaint=inpaint)
+        assert clip.prepared is not None
+        self._prepared = clip.prepared
+
+    def raw_depth(self, index: int) -> NDArray[np.float32]:
+        """[1, H, W] m, complete."""
+        return self._frame_of(index).layers.depth
+
+    def prev_from_cur(self, index: int) -> NDArray[np.float64]:
+        """[4, 4] m: the camera's motion from frame ``index`` to the one before."""
+        motion = self._frame_of(index).prev_from_cur
+        if motion is None:
+            raise ValueError(f"`index` must be 1 or more, a frame of {self.clip.name} with one before, got {index}")
+        return motion
+
+    def mask(self, index: int) -> NDArray[np.bool_]:
+        """M [1, H, W], True = static background."""
+        return self._frame_of(index).layers.mask
+
+    def seen(self, index: int) -> Seen:
+        """The frame's layers and objects."""
+        return self._once("layers", index, lambda: self._seen(index))
+
+    def _seen(self, index: int) -> Seen:
+        frame = self._frame_of(index)
+        objects_of = objects.segment(frame.layers.mask, frame.layers.depth)
+        return Seen(frame.layers, objects_of, frame.velocity, frame.own)
+
+    def _frame_of(self, index: int) -> Prepared:
+        return self._once("prepared frame", index, lambda: self._prepared.frame(index))
