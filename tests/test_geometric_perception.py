@@ -133,6 +133,31 @@ def test_without_labels_motion_makes_the_mask() -> None:
     assert (~mask[0][moving]).mean() > 0.4 > 0.03 > (~mask[0][~moving]).mean()
 
 
+def test_masks_of_a_clip_are_from_one_source() -> None:
+    """Cityscapes labels one frame of 30: M(t) from its labels and M(t-1) from motion would be of different objects."""
+    clip = drive(4).clip
+    some = tuple(replace(s, labels=s.labels if i == FRAME else None) for i, s in enumerate(clip))
+    partly, blind = Perception(replace(clip, samples=some)), Perception(without(clip, "labels"))
+    for index in (FRAME - 1, FRAME):
+        assert np.array_equal(partly.mask(index), blind.mask(index))
+    assert np.array_equal(partly.prev_from_cur(FRAME), blind.prev_from_cur(FRAME))
+    assert np.array_equal(partly.seen(FRAME).layers.depth, blind.seen(FRAME).layers.depth)  # the sky, too
+    assert not np.array_equal(partly.mask(FRAME), Perception(clip).mask(FRAME))
+
+
+def test_the_background_is_inpainted_as_asked() -> None:
+    clip = drive(4).clip
+
+    def white(colour: np.ndarray, hole: np.ndarray, road: np.ndarray) -> np.ndarray:
+        return np.ones_like(colour)
+
+    layers = Perception(clip, inpaint=white).seen(FRAME).layers
+    assert (layers.background_image[:, ~layers.mask[0]] == 1).all()
+    assert np.array_equal(Perception(clip, inpaint="telea").mask(FRAME), layers.mask)
+    with pytest.raises(ValueError, match="`method` must be one of"):
+        Perception(clip, inpaint="paint")
+
+
 def test_what_rides_along_is_background() -> None:
     bonnet = np.zeros((1, HEIGHT, WIDTH), bool)
     bonnet[:, 80:, 100:220] = True

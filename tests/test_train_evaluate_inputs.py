@@ -1,20 +1,34 @@
 """train.evaluate_inputs: where depth comes from, and what no forecast may see."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from forecaster_scenes import TINY, stir
 
-from train.evaluate_inputs import PAIR, check_stereo, depths, given, known_of, label_of, plain
-from train.evaluate_windows import Setup, forecast, perceptions_of, presenters, views_of, window
+from train.evaluate_inputs import (
+    PAIR,
+    Preprocessing,
+    check_stereo,
+    depths,
+    given,
+    known_of,
+    label_of,
+    plain,
+    sentences,
+)
+from train.evaluate_setup import Setup
+from train.evaluate_windows import forecast, inputs_of, perceptions_of, prepared, presenters, views_of, window
 from train.protocols import NOW, NOW_BORDER, PROTOCOLS, Name
 from vestcl import metrics
 from vestcl.data import Street
 from vestcl.data.sample import Clip, RightCamera
-from vestcl.data.sources import ImageArray
+from vestcl.data.sources import DisparityFile, ImageArray
 from vestcl.forecast import View
+from vestcl.forecast_command import Estimators
+from vestcl.inputs import Inputs
 from vestcl.models.forecaster import Forecaster
 from vestcl.scoring import GEOMETRIC, SOURCE, Truth
 from vestcl.scoring.border import blacken_border
@@ -102,6 +116,72 @@ def test_the_answer_is_not_seen(clip: Clip, name: Name) -> None:
         source = views_of(seen, setup(name))
         made.append(forecast(perception, 2, source, setup(name))[GEOMETRIC].forecast.frames[0][SOURCE].image)
     assert np.array_equal(*shown) and np.array_equal(*made)
+
+
+def test_frames_without_depth_do_not_see_the_answer(clip: Clip) -> None:
+    """Scans that are missing for some frames: depth there is from motion, whatever the right camera sees."""
+    some = [dataclasses.replace(s, depth=s.depth if i in (0, 3) else None) for i, s in enumerate(clip)]
+    partly, depths_seen = dataclasses.replace(clip, samples=tuple(some)), []
+    for seen in (partly, with_other_right(partly)):
+        assert depths(seen, PROTOCOLS["kitti-space"], False) == ("clip",)
+        ((ending, perception),) = perceptions_of(seen, setup("kitti-space")).items()
+        depths_seen.append(perception.raw_depth(2))
+        assert ending == "" and np.array_equal(perception.raw_depth(3), clip[3].read_depth())
+    assert np.array_equal(*depths_seen)
+    late = [dataclasses.replace(s, depth=s.depth if i == 3 else None) for i, s in enumerate(clip)]
+    assert depths(dataclasses.replace(clip, samples=tuple(late)), PROTOCOLS["kitti-space"], False) == ("clip",)
+
+
+def test_disparity_files_are_of_the_pair(clip: Clip) -> None:
+    """Cityscapes' disparity is matched against the right image of its frame: rows say so, and where that is judged,
+    or next to it, depth is from motion."""
+    matched = DisparityFile(Path("disparity.png"), 0.2, 2262.5)
+    seen = dataclasses.replace(clip, samples=tuple(dataclasses.replace(s, depth=matched) for s in clip))
+    for name, wanted in {
+        "cityscapes-prediction": ("clip",),
+        "kitti-space": ("motion",),
+        "kitti-space-time": ("motion", "clip"),
+    }.items():
+        assert depths(seen, PROTOCOLS[name], False) == wanted  # type: ignore[index]
+    assert depths(seen, PROTOCOLS["kitti-space-time"], True) == ("motion", "pair")
+    assert list(perceptions_of(seen, setup("cityscapes-prediction"))) == [PAIR]
+    assert list(perceptions_of(seen, setup("kitti-space-time"))) == ["", PAIR]
+    both = inputs_of(seen, setup("kitti-space-time"))
+    words = [given.depth for _, given in both.values()]
+    assert words == ["motion", "disparity files, matched in the stereo pair"]
+
+
+def test_classes_make_the_mask_of_both_frames(clip: Clip) -> None:
+    """With a mask model the paper's M, of parked cars too; of a clip that labels one frame, as Cityscapes does."""
+
+    def classes(image: np.ndarray) -> np.ndarray:
+        ids = np.zeros((1, *image.shape[1:]), np.uint8)
+        ids[..., :40] = 13
+        return ids
+
+    how = Preprocessing(mask_model="a/b", estimators=Estimators(None, classes))
+    some = [dataclasses.replace(s, labels=s.labels if i == 2 else None) for i, s in enumerate(clip)]
+    seen, wanted = (
+        dataclasses.replace(clip, samples=tuple(some)),
+        dataclasses.replace(setup("street"), preprocessing=how),
+    )
+    (perception,) = perceptions_of(prepared(seen, wanted), wanted).values()
+    for index in (1, 2):
+        assert (~perception.mask(index)[..., :40]).all() and perception.mask(index)[..., 40:].all()
+    (given_words,) = (words for _, words in inputs_of(prepared(seen, wanted), wanted).values())
+    assert given_words.masks == "the classes of a/b"
+
+
+def test_sentences_name_clips_that_differ() -> None:
+    one = Inputs("laser scans, densified", "motion", "optical flow and depth", "regions")
+    other = Inputs("the stereo pair at t-1 and t", "motion", "optical flow and depth", "regions", stereo=True)
+    assert sentences({"a": {"": one}, "b": {"": one}}) == (
+        "Depth is from laser scans, densified, masks are from motion.",
+        "Camera motion up to t is from optical flow and depth, inpainting is by regions.",
+    )
+    first, second = sentences({"a": {"": one}, "b": {PAIR: other}, "c": {"": one}})
+    assert first.startswith("a, c: Depth is from laser scans") and first.endswith("inpainting is by regions.")
+    assert second.startswith('b: Depth is from the stereo pair at t-1 and t (rows ending in "stereo pair"), masks')
 
 
 def test_the_pair_has_rows_of_its_own(clip: Clip) -> None:

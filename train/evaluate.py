@@ -33,7 +33,7 @@ from train.evaluate_sheets import write_sheets
 from train.evaluate_windows import Part, plan, read_inputs, read_part, run_part
 from train.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
-from vestcl import __version__, command_line, interrupt, peer, runtime
+from vestcl import __version__, command_line, interrupt, options, peer, runtime
 from vestcl.bench import _results
 from vestcl.inputs import Inputs
 from vestcl.io.atomic import write_bytes
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         evaluate(config)
     except ERRORS as error:
-        return failed(error)
+        return failed(options.as_typed(str(error), config))
     return 0
 
 
