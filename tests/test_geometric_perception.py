@@ -16,6 +16,7 @@ from geometric_scenes import HEIGHT, WIDTH, drive
 
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DepthArray, DepthFile, ImageArray
+from vestcl.geometric.forecast import input_notes
 from vestcl.geometric.perception import Perception
 from vestcl.scene.layers import SKY_DEPTH
 
@@ -143,6 +144,8 @@ def test_masks_of_a_clip_are_from_one_source() -> None:
     assert np.array_equal(partly.prev_from_cur(FRAME), blind.prev_from_cur(FRAME))
     assert np.array_equal(partly.seen(FRAME).layers.depth, blind.seen(FRAME).layers.depth)  # the sky, too
     assert not np.array_equal(partly.mask(FRAME), Perception(clip).mask(FRAME))
+    assert input_notes(partly, FRAME) == ("1 of 4 frames have labels: masks of all are from motion",)
+    assert input_notes(blind, FRAME) == input_notes(Perception(clip), FRAME) == ()
 
 
 def test_the_background_is_inpainted_as_asked() -> None:

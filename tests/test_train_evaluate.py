@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from forecaster_scenes import SMALL, TINY, stir
+from kitti_trees import SIZE, drives
 from st_lpips_weights import public_state
-from test_train_protocols import calibration
 
 from train import evaluate, evaluate_windows
 from train.evaluate import Evaluation, main
@@ -22,14 +22,12 @@ from vestcl import peer
 from vestcl.compare import FLOW, REPEAT
 from vestcl.data import Street
 from vestcl.data.splits import KITTI_PREDICTION_TEST, KITTI_PREDICTION_TRAIN, KITTI_VIEWS_TEST, KITTI_VIEWS_TRAIN
-from vestcl.io import read_pixels, write_pixels
-from vestcl.io.images import to_pixels
+from vestcl.io import read_pixels
 from vestcl.models._checkpoint import write_checkpoint
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.scoring import GEOMETRIC, ORACLE, OTHER_CAMERA
 
-SIZE = 48, 160
 STREETS: dict[str, Any] = {
     "protocol": "street", "height": SIZE[0], "width": SIZE[1], "steps": 2, "horizons": (1, 2), "samples": 1,
     "seeds": (3, 5),
@@ -172,22 +170,6 @@ def test_a_part_that_holds_something_else_is_told(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- KITTI raw
-
-
-def drives(root: Path, names: tuple[str, ...], frames: int = 7) -> Path:
-    """One street, seen by both cameras of KITTI's rig, as every one of the drives."""
-    clip = Street.generate(3).clip(frames, *SIZE, samples=1)
-    K, right = clip[0].K, clip[0].right
-    assert right is not None
-    flat = f"{K[0, 0]} 0 {K[0, 2] - 0.5} {{}} 0 {K[1, 1]} {K[1, 2] - 0.5} 0 0 0 1 0"
-    calibration(root, flat.format(0), flat.format(K[0, 0] * right.right_from_left[0, 3]), f"{SIZE[1]} {SIZE[0]}")
-    for name in names:
-        for index, sample in enumerate(clip):
-            assert sample.right is not None
-            for camera, image in (("02", sample.read_image()), ("03", sample.right.read_image())):
-                path = root / name[:10] / name / f"image_{camera}" / "data" / f"{index:010}.png"
-                write_pixels(path, to_pixels(image).astype(np.uint8))
-    return root
 
 
 def test_the_papers_protocol_on_kitti(tmp_path: Path, model: Path) -> None:

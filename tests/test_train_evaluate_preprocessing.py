@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 from forecaster_scenes import SMALL, TINY, stir
-from test_train_evaluate import SIZE, drives, run
+from kitti_trees import SIZE, drives
+from test_train_evaluate import run
 
 from train import evaluate
 from train.evaluate import main

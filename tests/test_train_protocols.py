@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
-from data_files import picture, write_text
+from data_files import picture
+from kitti_trees import calibration
 
 from train.evaluate_windows import PART_WINDOWS, Part, plan
 from train.protocols import HELD_OUT, NOW, PROTOCOLS, Name, Where, currents
@@ -19,15 +20,6 @@ TEST_FRAMES = {"0060": 78, "0084": 383, "0093": 433, "0096": 475}
 
 #: Snippets of Cityscapes' val. It has three cities; opening a snippet lists its city, so more of them test faster.
 SNIPPETS, CITIES = 500, [f"city-{letter}" for letter in "abcdefghijklmnopqrstuvwxy"]
-
-P2 = "721.5377 0 609.5593 44.85728 0 721.5377 172.854 0.2163791 0 0 1 0.002745884"
-P3 = "721.5377 0 609.5593 -339.5242 0 721.5377 172.854 2.199936 0 0 1 0.002729905"
-
-
-def calibration(root: Path, left: str = P2, right: str = P3, size: str = "1242 375") -> None:
-    sizes = (f"S_rect_0{camera}: {size}" for camera in (2, 3))
-    lines = "R_rect_00: 1 0 0 0 1 0 0 0 1", f"P_rect_02: {left}", f"P_rect_03: {right}", *sizes
-    write_text(root / "2011_09_26" / "calib_cam_to_cam.txt", *lines)
 
 
 def empty_drives(root: Path, frames: Mapping[str, int]) -> Path:

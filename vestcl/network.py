@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, Skipped, View
-from vestcl.geometric.forecast import gap_notes
+from vestcl.geometric.forecast import input_notes
 from vestcl.geometric.perception import Perception
 from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
@@ -114,7 +114,7 @@ def forecast_frames(
     profile = with_rest(watch.take(), whole)
     skipped = what_was_skipped(tally, profile)
     seconds = perception.seconds | {"network": whole}
-    notes = (*gap_notes(perception, index), *([] if note is None else [note]))
+    notes = (*input_notes(perception, index), *([] if note is None else [note]))
     return Forecast(
         model.config.name, motions, frames, seconds, profile, skipped, notes, mode or model.config.default_mode
     )

@@ -104,7 +104,16 @@ def forecast_frames(
             tell("render")
             frames[-1][view.name] = _render(moved, clip[index].K if view.K is None else view.K, view, clip)
     seconds = perception.seconds | {"render": time.perf_counter() - start}
-    return Forecast(METHOD, cameras[:steps], frames, seconds, notes=gap_notes(perception, index))
+    return Forecast(METHOD, cameras[:steps], frames, seconds, notes=input_notes(perception, index))
+
+
+def input_notes(perception: Perception, index: int) -> tuple[str, ...]:
+    """Lines on what forecasts from frame ``index`` lack: `gap_notes`, and labels that only some frames have."""
+    labelled = sum(sample.labels is not None for sample in perception.clip)
+    if perception.has_labels or not labelled:
+        return gap_notes(perception, index)
+    partly = f"{labelled} of {len(perception.clip)} frames have labels: masks of all are from motion"
+    return (*gap_notes(perception, index), partly)
 
 
 def gap_notes(perception: Perception, index: int) -> tuple[str, ...]:
