@@ -144,7 +144,7 @@ def test_masks_of_a_clip_are_from_one_source() -> None:
     assert np.array_equal(partly.prev_from_cur(FRAME), blind.prev_from_cur(FRAME))
     assert np.array_equal(partly.seen(FRAME).layers.depth, blind.seen(FRAME).layers.depth)  # the sky, too
     assert not np.array_equal(partly.mask(FRAME), Perception(clip).mask(FRAME))
-    assert input_notes(partly, FRAME) == ("1 of 4 frames have labels: masks of all are from motion",)
+    assert input_notes(partly, FRAME) == ("1 of 8 frames have labels: masks of all are from motion",)
     assert input_notes(blind, FRAME) == input_notes(Perception(clip), FRAME) == ()
 
 

@@ -1,6 +1,9 @@
 """Prepared clips in place of recorded ones: their frames as a clip, and what was computed of them as a perception."""
 
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +13,8 @@ from vestcl.geometric import objects
 from vestcl.geometric.perception import Perception, Seen
 from vestcl.prepared import Prepared, PreparedClip
 from vestcl.scene.inpainters import Inpainter
+
+Element = TypeVar("Element", np.float32, np.bool_)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +41,21 @@ class PreparedImage:
 
 
 @dataclass(frozen=True, eq=False)
+class _Part(Generic[Element]):
+    """A part of a prepared frame: a DepthSource or a RegionSource."""
+
+    clip: PreparedClip
+    index: int
+    take: Callable[[Prepared], NDArray[Element]]
+
+    def read(self) -> NDArray[Element]:
+        """[1, H, W]."""
+        return self.take(self.clip.frame(self.index))
+
+
+@dataclass(frozen=True, eq=False)
 class PreparedSequence(Clip):
-    """A prepared clip's images, cameras, poses and times as a clip; it has no depth and no labels of its own."""
+    """A prepared clip's images, depth, cameras, poses and times as a clip; it has no labels."""
 
     prepared: PreparedClip | None = None
     """What it was made of."""
@@ -64,6 +82,8 @@ def _sample(prepared: PreparedClip, index: int) -> Sample:
         prepared.K(index),
         timestamp=None if interval is None else float(prepared.positions[index]) * interval,
         world_from_cam=prepared.world_from_cam(index),
+        depth=_Part(prepared, index, lambda frame: frame.layers.depth),
+        ego_vehicle=_Part(prepared, index, lambda frame: frame.own),
         right=_right(prepared, index),
     )
 
@@ -79,13 +99,16 @@ def _right(prepared: PreparedClip, index: int) -> RightCamera | None:
 class PreparedPerception(Perception):
     """What `vestcl prepare` computed of a clip; flow, and each point's velocity from it, are computed here.
 
+    Its clip has no right camera: whatever is computed from its frames, by `vestcl.peer` for one, has their depth.
+
     Args:
         clip: of `as_clip`, at its own size.
-        inpaint: see `Perception`; of frames that are computed from this one's, by `vestcl.peer` for one.
+        inpaint: see `Perception`; of frames that are computed from this one's.
     """
 
     def __init__(self, clip: PreparedSequence, *, inpaint: Inpainter | None = None) -> None:
-        super().__init__(clip, inpaint=inpaint)
+        bare = tuple(dataclasses.replace(sample, right=None) for sample in clip)
+        super().__init__(dataclasses.replace(clip, samples=bare), inpaint=inpaint)
         assert clip.prepared is not None
         self._prepared = clip.prepared
 
