@@ -19,7 +19,7 @@ _MOTIONS: Final = 4
 #: Seconds between frames of a clip without times: KITTI's.
 _INTERVAL: Final = 0.1
 
-#: Candidates are tested over one frame for the first step, and over two for later ones, which tell apart what stops.
+#: Candidates are tested over one frame, and over two, which tell apart what goes on and what stops.
 _TESTED: Final = (1, 2)
 
 
@@ -29,8 +29,8 @@ class Paths:
 
     frame: backtest.Frame
     errors: tuple[NDArray[np.float32], ...]
-    """[C, H, W] by `_TESTED`: how wrong the candidates would have been; the last one counts for all later steps.
-    Without any, points have their objects' velocities."""
+    """[C, H, W]: how wrong the candidates would have been, for the first step and for all later ones
+    (`backtest.by_step`). Without any, points have their objects' velocities."""
 
     def at(self, ahead: float, future_from_cur: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points [3, H, W] m in the camera after ``ahead`` intervals, which ``future_from_cur`` leads to."""
@@ -40,7 +40,7 @@ class Paths:
             points = rays * self.frame.depth + ahead * self.frame.velocity
             return np.tensordot(future_from_cur[:3, :3], points, 1) + future_from_cur[:3, 3, None, None]
         positions, depth = backtest.candidates(self.frame, future_from_cur, ahead)
-        errors = self.errors[0] if ahead <= _TESTED[0] else self.errors[-1]
+        errors = self.errors[0] if ahead <= 1 else self.errors[-1]
         u, v = backtest.mixed(positions, errors)
         return np.tensordot(np.linalg.inv(K), np.stack([u, v, np.ones_like(u)]), 1) * depth
 
@@ -63,7 +63,8 @@ def point_paths(perception: Perception, index: int) -> Paths:
         positions, _ = backtest.candidates(before, camera, ahead)
         flows = [perception.correspondence(i).flow_uv for i in range(index, first, -1)]
         errors.append(backtest.backtest(positions, before, perception.image(index), flows))
-    return Paths(perception.frame(index), tuple(errors))
+    frame = perception.frame(index)
+    return Paths(frame, backtest.by_step(errors, frame.monocular))
 
 
 def forecast_cameras(
@@ -77,4 +78,5 @@ def forecast_cameras(
     clip, seen = perception.clip, range(max(index + back - _MOTIONS + 1, 1), index + 1)
     motions = [np.linalg.inv(perception.prev_from_cur(i)) for i in seen]
     interval = clip.interval or _INTERVAL
-    return forecast_camera(motions, [clip.elapsed(i) * interval for i in seen], [each * interval for each in ahead])
+    times = [clip.elapsed(i) * interval for i in seen], [each * interval for each in ahead]
+    return forecast_camera(motions, *times, by_flow=perception.is_monocular(index))

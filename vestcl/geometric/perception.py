@@ -145,7 +145,7 @@ class Perception:
         if index == 0:
             return backtest.Frame(*asked, np.zeros_like(image[:2]), np.eye(4), K)
         motion = self.correspondence(index).flow_uv, self.prev_from_cur(index)
-        return backtest.Frame(*asked, *motion, K, self.clip.elapsed(index), self._is_monocular(index))
+        return backtest.Frame(*asked, *motion, K, self.clip.elapsed(index), self.is_monocular(index))
 
     def inverse_std(self, index: int) -> float:
         """Standard deviation of 1 / depth, 1/m."""
@@ -213,7 +213,7 @@ class Perception:
             )
         return None
 
-    def _is_monocular(self, index: int) -> bool:
+    def is_monocular(self, index: int) -> bool:
         """Whether depth comes, wholly or in part, from the motion of one camera."""
         return self._is_estimated(index) or (self.clip[index].right is None and self._given_depth(index) is None)
 
@@ -262,7 +262,7 @@ class Perception:
             return power(self.prev_from_cur(index - 1), self.clip.elapsed(index) / self.clip.elapsed(index - 1))
         if self._is_estimated(index):
             return self._combined(index).prev_from_cur
-        if self._is_monocular(index):
+        if self.is_monocular(index):
             return self._from_motion(index).prev_from_cur
         sample = self.clip[index]
         static = ~sample.read_ego_vehicle()
@@ -287,7 +287,7 @@ class Perception:
     def _see(self, index: int) -> Seen:
         sample, mask, depth = self.clip[index], self.mask(index), self.raw_depth(index)
         own = sample.read_ego_vehicle().copy()
-        if index > 0 and not self._is_monocular(index):
+        if index > 0 and not self.is_monocular(index):
             view = View(self.correspondence(index), self.prev_from_cur(index))
             depth = refine_depth(depth, self.inverse_std(index), sample.K, [view], mask & ~own)
         layers = build_layers(self.image(index), depth, mask, sky=self._sky(index, depth), inpaint=self.inpaint)
@@ -296,7 +296,7 @@ class Perception:
         if index > 0:
             before = self.raw_depth(index - 1)
             # Two depths whose scales may differ by more than an object moves.
-            if self._is_monocular(index) or self._is_monocular(index - 1):
+            if self.is_monocular(index) or self.is_monocular(index - 1):
                 before = np.zeros_like(before)
             measured = self.raw_depth(index), before, self.inverse_std(index)
             motion = self.correspondence(index), self.prev_from_cur(index), sample.K

@@ -29,9 +29,8 @@ _MOST, _NOISE = 0.05, 1e-5
 #: along the flow, so that it need not be exact, and then.
 _WIDTH, _BEFORE, _AFTER = 832, 2.0, 8.0
 
-#: Flow itself must do as well as the others over the whole image: by chance it does so in places, and it forecasts what
-#: comes nearer worse with every step. Its errors grow with this power of their mean over the least of the others.
-_WHOLE: Final = 4.0
+#: Errors of flow itself grow with this power of their mean over the least of the other candidates.
+_WHOLE: Final = 6.0
 
 #: Flow that leaves the rigid motion by more pixels an interval than that is a wrong match.
 _LARGEST: Final = 40.0
@@ -120,10 +119,26 @@ def backtest(positions: Array, before: Frame, after: Array, flows: Sequence[Arra
         smooth = _smooth(np.minimum(error, np.float32(_MOST)), _BEFORE)
         brought = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         errors.append(_smooth(np.asarray(brought, np.float32), _AFTER) + np.float32(_NOISE))
-    if before.monocular:
-        others = min(float(error.mean()) for error in errors[:-1])
-        errors[-1] = errors[-1] * np.float32(max(float(errors[-1].mean()) / others, 1.0) ** _WHOLE)
     return np.stack(errors)
+
+
+def by_step(errors: Sequence[Array], monocular: bool) -> tuple[Array, ...]:
+    """Errors that count for the first step, and for all later ones: there the geometric mean over all tests.
+
+    Flow itself, the last candidate of ``monocular`` frames, has its errors raised where it was worse than another over
+    the whole image in any test: by chance it does as well in places, and it forecasts what comes nearer worse with
+    every step.
+
+    Args:
+        errors: of `backtest`, over one frame, over two ...
+        monocular: as `Frame` has it.
+    """
+    if monocular:
+        means = [error.mean(axis=(1, 2)) for error in errors]
+        worse = max([1.0, *(float(mean[-1] / mean[:-1].min()) for mean in means)])
+        errors = [np.concatenate([error[:-1], error[-1:] * np.float32(worse**_WHOLE)]) for error in errors]
+    later = [np.exp(np.mean(np.log(errors), axis=0))] if len(errors) > 1 else []
+    return (*errors[:1], *later)
 
 
 def mixed(positions: Array, errors: Array) -> Array:

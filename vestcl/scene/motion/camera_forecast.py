@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 from vestcl.scene.motion.gauss_markov import (
     MEMORY,
     Bank,
+    Model,
     decaying_rate,
     driven_rate,
     joined,
@@ -36,10 +37,12 @@ from vestcl.scene.motion.gauss_markov import (
 
 Array = NDArray[np.float64]
 
-#: Standard deviation of a measured rotation, rad an axis: of flow between two sharp images (a tenth of a pixel), what
-#: PnP over a dense flow gives on a driving video with depth, and of the yaw without depth, as a turn and a step aside
-#: look much alike.
-_TURN_NOISE: Final = (np.radians(0.01), np.radians(0.045), np.radians(0.12))
+#: Standard deviation of a measured rotation, rad an axis: what PnP over a dense flow gives on a driving video with
+#: depth, and of the yaw without depth, as a turn and a step aside look much alike.
+_TURN_NOISE: Final = (np.radians(0.045), np.radians(0.12))
+
+#: Without depth a rotation has no depth's errors: between two sharp images flow gives it to a tenth of a pixel.
+_FLOW_NOISE: Final = np.radians(0.01)
 
 #: Yaw rate: it decays within the seconds that a bend takes, its rate of change follows the steering wheel (s), and
 #: reaches from a lane's corrections to a crossing's (rms, rad/s^2: a turn of 30 degrees/s entered within 1 s is 0.5).
@@ -77,16 +80,26 @@ _ACROSS_NOISE: Final = 0.004
 #: So many motions are the fewest to filter: one has no trend.
 FEWEST: Final = 2
 
-_YAW: Final = tuple(
-    joined(driven_rate(decay, seconds, rms), noise=noise)
-    for decay, seconds, rms, noise in itertools.product(_BENDS, _STEERING, _TURNING, _TURN_NOISE)
-)
-_NOD: Final = tuple(
-    joined(oscillator(hertz, damping, np.radians(degrees)), decaying_rate(seconds, np.radians(rate)), noise=noise)
-    for hertz, damping, degrees, rate, seconds, noise in itertools.product(
-        _BODY_HERTZ, _BODY_DAMPING, _BODY_DEGREES, _ROAD_RATES, _ROAD_SECONDS, _TURN_NOISE[:2]
+
+def _yaw(*noises: float) -> tuple[Model, ...]:
+    return tuple(
+        joined(driven_rate(decay, seconds, rms), noise=noise)
+        for decay, seconds, rms, noise in itertools.product(_BENDS, _STEERING, _TURNING, noises)
     )
-)
+
+
+def _nod(*noises: float) -> tuple[Model, ...]:
+    return tuple(
+        joined(oscillator(hertz, damping, np.radians(degrees)), decaying_rate(seconds, np.radians(rate)), noise=noise)
+        for hertz, damping, degrees, rate, seconds, noise in itertools.product(
+            _BODY_HERTZ, _BODY_DAMPING, _BODY_DEGREES, _ROAD_RATES, _ROAD_SECONDS, noises
+        )
+    )
+
+
+#: Models of yaw, and of pitch and roll, by whether rotations were measured without depth.
+_YAW: Final = {False: _yaw(*_TURN_NOISE), True: _yaw(_FLOW_NOISE, *_TURN_NOISE)}
+_NOD: Final = {False: _nod(_TURN_NOISE[0]), True: _nod(_FLOW_NOISE, _TURN_NOISE[0])}
 _SPEED: Final = tuple(
     joined(driven_rate(np.inf, seconds, rms, _ANY_SPEED), noise=noise)
     for seconds, rms, noise in itertools.product(_PEDAL_SECONDS, _ACCELERATION, _LENGTH_NOISE)
@@ -99,14 +112,15 @@ class CameraForecaster:
     S drives may be filtered at once; all of them have their frames at the same times.
     """
 
-    def __init__(self, batch: int = 1) -> None:
+    def __init__(self, batch: int = 1, by_flow: bool = False) -> None:
         """Nothing measured yet.
 
         Args:
             batch: S.
+            by_flow: whether motions are measured from flow only, without depth.
         """
         self.measured = 0
-        self._pitch, self._yaw, self._roll = Bank(_NOD, batch), Bank(_YAW, batch), Bank(_NOD, batch)
+        self._pitch, self._yaw, self._roll = (Bank(of[by_flow], batch) for of in (_NOD, _YAW, _NOD))
         self._speed = Bank(_SPEED, batch)
         self._sideways, self._vertical = _Across(batch), _Across(batch)
         self._constant: tuple[Array, float] | None = None
@@ -226,7 +240,7 @@ class _Across:
 
 
 def forecast_camera(
-    motions: Sequence[ArrayLike | None], intervals: Sequence[float], ahead: Sequence[float]
+    motions: Sequence[ArrayLike | None], intervals: Sequence[float], ahead: Sequence[float], by_flow: bool = False
 ) -> list[Array]:
     """``future_from_cur`` by the last motions of a camera.
 
@@ -235,6 +249,7 @@ def forecast_camera(
             measured. At least one is not None.
         intervals: seconds of each.
         ahead: seconds after the last frame, rising.
+        by_flow: whether motions are measured from flow only, without depth.
 
     Returns:
         [4, 4] m for each of ``ahead``.
@@ -246,7 +261,7 @@ def forecast_camera(
         raise ValueError(
             f"`motions` and `intervals` must have equal length of 1 or more, got {len(motions)}, {len(intervals)}"
         )
-    forecaster = CameraForecaster()
+    forecaster = CameraForecaster(by_flow=by_flow)
     for motion, seconds in zip(motions, intervals, strict=True):
         forecaster.measure(motion, seconds)
     return [future[0] for future in forecaster.forecast(ahead)]
