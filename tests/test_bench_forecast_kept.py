@@ -183,10 +183,10 @@ def test_error_shares_by_construction() -> None:
 
 
 def test_regions_of_a_street_follow_the_camera() -> None:
-    """A static street has no objects, wherever it is seen from."""
+    """Most of a street is at rest; sky, near and far ground are all there."""
     clip = Street.generate(4).clip(5, *SIZE, samples=1)
     config = ForecastBench(("street:4",), **TINY)
     (_, facts) = next(running.run_clip(clip, [2], config))
     values = facts[0].values
-    assert values["area_of_sky"][0] > 0.05 and values["area_of_near"][0] > 0.1 and values["area_of_objects"][0] < 0.4
+    assert values["area_of_sky"][0] > 0.02 and values["area_of_near"][0] > 0.1 and values["area_of_objects"][0] < 0.4
     assert sum(values[f"area_of_{name}"][0] for name in REGIONS) == pytest.approx(1)

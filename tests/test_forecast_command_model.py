@@ -12,6 +12,7 @@ from forecaster_scenes import SMALL, TINY
 from stand_ins import put_module
 
 from vestcl import cli, pretrained
+from vestcl.compare import ORACLE
 from vestcl.data.sample import Clip
 from vestcl.forecast_files import read_forecast
 from vestcl.models.forecaster import Forecaster
@@ -116,7 +117,7 @@ def test_estimators_see_forecast_frames(
     ("options", "words"),
     [
         (["--mode", "compose", "--perceive", "splatted"], '--perceive must not be given with mode "compose"'),
-        (["--perceive", "estimated"], '--perceive "estimated" needs --depth-model, --mask-model or both'),
+        (["--perceive", "estimated"], '--perceive "estimated" needs --depth-model (in metres), --mask-model or both'),
     ],
 )
 def test_what_cannot_be_perceived(
@@ -143,8 +144,9 @@ def test_the_geometric_one_is_scored_beside_the_networks(
     assert cli.main(told.split()) == 0
     assert [call[1:3] for call in (*network.calls, *geometric.calls)] == [(3, 2), (3, 2)]
     about = read_forecast(tmp_path).about
-    for view in ("source", "right"):
-        assert set(about["scores"][view]) == {"forecast", "geometric", "repeat last", "optical flow"}
+    assert list(about["scores"]["source"]) == ["forecast", "geometric", "repeat last", "optical flow"]
+    left = ["repeat last, left camera", "optical flow, left camera"]
+    assert list(about["scores"]["right"]) == ["forecast", "geometric", *left, ORACLE]
     scores = about["scores"]["source"]
     assert scores["forecast"][0]["psnr"] is None  # infinite: this one foresaw the frame
     assert scores["geometric"] == scores["repeat last"]  # as both repeat it

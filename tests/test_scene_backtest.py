@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vestcl.scene.motion.backtest import Frame, backtest, candidates, mixed, residual_flow
+from vestcl.scene.motion.backtest import Frame, backtest, by_step, candidates, mixed, residual_flow
 
 HEIGHT, WIDTH, FOCAL, DEPTH = 64, 160, 100.0, 10.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
@@ -134,3 +134,16 @@ def test_outside_of_the_image_nothing_is_decided() -> None:
     errors = errors_of(before, after, np.stack([away, away + 500]).astype(np.float32))
     np.testing.assert_allclose(errors[0], errors[1])
     assert np.isfinite(errors).all() and (errors > 0).all()
+
+
+def test_errors_by_step() -> None:
+    """Flow needs a margin; of two tests later steps take the geometric mean; a candidate that loses once is held back."""
+    first, second = (np.full((5, 2, 2), value, np.float32) for value in (0.01, 0.04))
+    once, later = by_step([first, second], monocular=False)
+    np.testing.assert_allclose(once[:, 0, 0], [0.01, 0.01, 0.0125, 0.0125, 0.0125], rtol=1e-5)
+    np.testing.assert_allclose(later[:, 0, 0], [0.02, 0.02, 0.025, 0.025, 0.025], rtol=1e-5)
+    assert len(by_step([first], monocular=True)) == 1 and by_step([], monocular=True) == ()
+    second[-1] *= 1.2
+    held = by_step([first, second], monocular=True)
+    np.testing.assert_allclose(held[0][-1] / once[-1], 1.2**6, rtol=1e-4)
+    np.testing.assert_allclose(held[0][:-1], once[:-1])

@@ -151,7 +151,7 @@ def test_perceive_is_of_models_that_see_their_forecast(tmp_path: Path) -> None:
     assert [later.perceived for later in both.later.values()] == ["splatted", None]
     for settings, message in (
         ({"model": files[1:], "perceive": "splatted"}, '`perceive` must not be given with mode "compose"'),
-        ({"model": files, "perceive": "estimated"}, '`perceive` "estimated" needs --depth-model, --mask-model or both'),
+        ({"model": files, "perceive": "estimated"}, r'"estimated" needs --depth-model \(in metres\), --mask-model or'),
         ({"perceive": "splatted"}, "`perceive` is how a network sees its own forecast; it needs `model`"),
     ):
         with pytest.raises(ValueError, match=message):
