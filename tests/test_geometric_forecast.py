@@ -129,6 +129,34 @@ def test_what_the_frame_before_showed_is_at_its_place() -> None:
         assert decibels(shown.planes[:3], wanted, where) > decibels(clip[NOW - 1].read_image(), wanted, where) + 4
 
 
+@dataclass(frozen=True)
+class Exposed:
+    """An image of another exposure, 8 bit."""
+
+    source: Any
+    gain: float
+    height: int = HEIGHT
+    width: int = WIDTH
+
+    def read(self) -> Any:
+        return np.float32(np.round((self.gain * self.source.read()).clip(0, 1) * 255) / 255)
+
+
+@pytest.mark.parametrize("gain", [1.2, 1 / 1.2])
+def test_what_the_frame_before_showed_is_as_bright_as_the_current_one(gain: float) -> None:
+    """Auto exposure: the frames up to t - 1 are brighter or darker than what follows."""
+    clip = perception(*PASSING).clip
+    earlier = [replace(sample, image=Exposed(sample.image, gain)) for sample in clip.samples[:NOW]]
+    jump = replace(clip, samples=(*earlier, *clip.samples[NOW:]))
+    before = _clouds(Perception(jump), NOW)[1](1, [np.eye(4)] * 2).image
+    wanted = clip[NOW - 1].read_image()
+    unclipped = gain * wanted < 0.95
+    assert np.abs(before - wanted)[unclipped].mean() < 0.01
+    frame, same = forecast_clip(jump, NOW, 1, [LEFT]).frames[0]["left"].image, forecast(*PASSING).frames[0]["left"]
+    wanted = clip[NOW + 1].read_image()
+    assert decibels(frame, wanted) > decibels(same.image, wanted) - 0.3
+
+
 # ---------------------------------------------------------------- views
 
 

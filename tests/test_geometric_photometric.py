@@ -45,6 +45,24 @@ def test_a_velocity_that_flow_knows_nothing_of(v: tuple[float, float, float], gr
     np.testing.assert_allclose(velocity[1], v, atol=0.06)
 
 
+@pytest.mark.parametrize("gain", [1.2, 1 / 1.2])
+@pytest.mark.parametrize("v", [(0.0, 0.0, 0.9), (0.6, 0.0, 0.0), (0.0, 0.0, -2.3), (0.0, 0.0, 0.0)])
+def test_exposure_may_change_between_the_frames(v: tuple[float, float, float], gain: float) -> None:
+    (labels, depth), pair = scene(), seen_moving(v)
+    pair = pair._replace(image=0.1 + 0.6 * pair.image, image_prev=gain * (0.1 + 0.6 * pair.image_prev))
+    np.testing.assert_allclose(search(labels, STILL, depth, pair)[1], v, atol=0.06)
+
+
+@pytest.mark.parametrize("gain", [1.2, 1 / 1.2])
+def test_a_correction_counts_whatever_the_exposure(gain: float) -> None:
+    v, still = (0.4, 0.0, 0.0), np.zeros((3, HEIGHT, WIDTH), np.float32)
+    plain = seen_moving(v)
+    plain = plain._replace(image=0.1 + 0.6 * plain.image, image_prev=0.1 + 0.6 * plain.image_prev)
+    other = plain._replace(image_prev=np.float32(gain) * plain.image_prev)
+    wanted, got = (confirmed(still + planes(*v), still, scene()[1], pair) for pair in (plain, other))
+    np.testing.assert_allclose(got, wanted, atol=0.02)
+
+
 def test_what_flow_says_is_tried_too() -> None:
     """A bump of 5 cm, which is not searched for."""
     v = np.array([0.4, 0.05, 0.9])

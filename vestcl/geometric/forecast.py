@@ -15,6 +15,7 @@ from vestcl.forecast import Forecast, Rendered, View
 from vestcl.geometric.paths import Paths, forecast_cameras, point_paths
 from vestcl.geometric.perception import Perception
 from vestcl.geometric.render import Cloud, Shown, holes, rendered, show
+from vestcl.scene.exposure import as_exposed
 from vestcl.scene.holes import deep_holes, fill_holes
 from vestcl.scene.inpainters import Inpainter
 
@@ -156,7 +157,8 @@ def _clouds(perception: Perception, index: int) -> list[MovingCloud]:
     cur_from_prev = np.asarray(np.linalg.inv(perception.prev_from_cur(index)), np.float64)
     shown = _shown(point_paths(perception, index), cur.own)
     since = cur_from_prev, perception.clip.elapsed(index)
-    before = _cloud(prev.layers.image, prev.layers.depth, ~prev.own, K, prev.velocity, *since)
+    image_prev = as_exposed(prev.layers.image, cur.layers.image, perception.correspondence(index).flow_uv)
+    before = _cloud(image_prev, prev.layers.depth, ~prev.own, K, prev.velocity, *since)
     hidden = ~cur.layers.mask & ~cur.own
     behind = _cloud(cur.layers.background_image, cur.layers.background_depth, hidden, K)
     return [shown, before, behind]

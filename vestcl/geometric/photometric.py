@@ -14,6 +14,7 @@ from vestcl.geometric.objects import some_points
 from vestcl.scene import _check
 from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import sample
+from vestcl.scene.exposure import STRIDE, nearest, tone_curve
 from vestcl.scene.motion_plane import rays_of
 
 Array = NDArray[np.float64]
@@ -78,13 +79,30 @@ class Pair(NamedTuple):
         difference = np.abs(seen - (colours if colours.ndim == 3 else colours[:, None])).mean(0)
         return np.where(z > 0.1, difference, np.float32(np.nan))
 
+    def equally_exposed(self, depth: NDArray[np.float32], velocity: NDArray[np.float32] | None = None) -> "Pair":
+        """The pair with the frame before as the frame at t is exposed, by the colours of points in both.
+
+        Args:
+            depth: [1, H, W] m at t; 0 = unknown.
+            velocity: [3, H, W] m a frame; None is 0 everywhere. Points that move otherwise are wrong matches, which the
+                median tolerates.
+        """
+        grid = np.s_[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+        points = rays_of(self.K, *depth.shape[1:])[grid] * depth[grid]
+        points = (points if velocity is None else points - velocity[grid]).reshape(3, -1)
+        x, y, z = self.K @ (self.prev_from_cur[:3, :3] @ points + self.prev_from_cur[:3, 3:])
+        known = (depth[grid].ravel() > 0) & (z > 0.1)
+        x, y = (np.where(known, at / np.maximum(z, 0.1) - 0.5, np.nan) for at in (x, y))
+        curve = tone_curve(nearest(self.image_prev, x, y), self.image[grid].reshape(3, -1))
+        return self._replace(image_prev=curve(self.image_prev))
+
 
 def search(things: NDArray[np.int32], by_flow: Array, depth: NDArray[np.float32], pair: Pair) -> Array:
     """v_n [n + 1, 3] m a frame for each thing: of 0, what flow says, and steps ahead and aside, what looks most alike.
 
     min over v of the mean over pixels of min(|I(p) - I_prev(project(K (R (x - v) + t)))|, OTHER), first along the
     camera's axes x and z, then around the best by ever smaller steps. Unless that is LEFT times what v = 0 gives or
-    less, the thing stands still.
+    less, the thing stands still. I_prev is shown as I is exposed, by the colours of the static background.
 
     Args:
         things: [H, W], 0 = background.
@@ -96,6 +114,7 @@ def search(things: NDArray[np.int32], by_flow: Array, depth: NDArray[np.float32]
         Row 0 is 0, as are things that stand, and all that are too small to tell.
     """
     found = np.zeros_like(by_flow)
+    pair = pair.equally_exposed(np.where(things > 0, np.float32(0), depth))
     valid = (things > 0) & (depth[0] > 0)
     for thing in range(1, len(found)):
         here = valid & (things == thing)
@@ -154,12 +173,12 @@ def confirmed(
         corrected: c [3, H, W] m a frame, from `vestcl.geometric.objects.follow_flow`.
         velocity: v [3, H, W] m a frame.
         depth: [1, H, W] m at t, above 0.
-        pair: both frames.
+        pair: both frames, which may be exposed differently.
 
     Returns:
         [3, H, W] m a frame.
     """
-    guide = _check.pixels(pair.image)
+    guide, pair = _check.pixels(pair.image), pair.equally_exposed(depth, velocity)
     before, after = (smooth(guide, _difference(v, depth, pair)) for v in (velocity, corrected))
     share = ((before - after) / ((1 - _LEFT) * before + _NOISE / 2)).clip(0, 1).astype(np.float32)
     return velocity + share * (corrected - velocity)

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vestcl import baselines
 from vestcl.scene import _check
+from vestcl.scene.exposure import matched_for_flow
 
 #: Error of flow where the picture's gradient is 1 a pixel, in pixels: bare asphalt (0.0025 a pixel on a motorway) and
 #: sky (0.002) get more than a pixel, grass and rough asphalt (0.02 on KITTI) 0.2.
@@ -31,7 +32,8 @@ def correspond(src: ArrayLike, dst: ArrayLike) -> Correspondence:
     """Flow f from ``src`` to ``dst``, and its error, the root of |f(p) + b(p + f(p))|^2 + (NOISE / least |grad src|)^2.
 
     b is the flow back: there and back again should end at p. Where the picture has no texture, or the same along a
-    line, flow may do so and still be wrong, hence the second part.
+    line, flow may do so and still be wrong, hence the second part. Where the exposure changes by 5 % or more, ``dst``
+    is given the histograms of ``src`` first.
 
     Args:
         src: [3, H, W] RGB in [0, 1].
@@ -44,14 +46,21 @@ def correspond(src: ArrayLike, dst: ArrayLike) -> Correspondence:
     """
     src = _check.planes("src", src, 3)
     dst = _check.planes("dst", dst, 3, src)
-    pair = [torch.from_numpy(picture)[None] for picture in (src, dst)]
-    there = baselines.optical_flow(pair[0], pair[1])[0].numpy()
-    back = baselines.optical_flow(pair[1], pair[0])[0].numpy()
+    there = _flow(src, dst)
+    matched = matched_for_flow(dst, src, there)
+    if matched is not dst:
+        there = _flow(src, matched)
+    back = _flow(matched, src)
     y, x = np.mgrid[: src.shape[1], : src.shape[2]].astype(np.float32)
     returned = sample(back, x + there[0], y + there[1], outside=np.inf)
     missed = (there + returned).astype(np.float64)
     error = np.sqrt((missed**2).sum(0) + np.square(_NOISE / np.maximum(_texture(src), 1e-6)))
     return Correspondence(there, error[None].astype(np.float32))
+
+
+def _flow(src: NDArray[np.float32], dst: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[2, H, W] px."""
+    return baselines.optical_flow(torch.from_numpy(src)[None], torch.from_numpy(dst)[None])[0].numpy()
 
 
 def _texture(image: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.scene.correspondence import sample
+from vestcl.scene.exposure import as_exposed
 from vestcl.scene.motion_plane import rays_of
 from vestcl.scene.parallax import moved_pixels, pixel_centres
 
@@ -106,20 +107,22 @@ def backtest(positions: Array, before: Frame, after: Array, flows: Sequence[Arra
     Args:
         positions: [C, 2, H, W] px, where the pixels of an earlier frame were forecast to be at t.
         before: that frame.
-        after: [3, H, W], the image at t.
+        after: [3, H, W], the image at t, which may be exposed differently.
         flows: [2, H, W] px each, from t to the frame before and so on until the earlier frame.
 
     Returns:
         [C, H, W], above 0.
     """
-    x, y = np.asarray(pixel_centres(*after.shape[1:]) - 0.5, np.float32)
+    start = np.asarray(pixel_centres(*after.shape[1:]) - 0.5, np.float32)
+    x, y = start
     for flow_uv in flows:
         along = sample(flow_uv, x, y, outside=0.0)
         x, y = x + along[0], y + along[1]
+    image_before = as_exposed(before.image, after, np.stack([x, y]) - start)
     errors = []
     for u, v in positions:
         found = sample(after, u - 0.5, v - 0.5, outside=np.nan)
-        error = np.nan_to_num(np.square(found - before.image).mean(0), nan=_MOST)
+        error = np.nan_to_num(np.square(found - image_before).mean(0), nan=_MOST)
         smooth = _smooth(np.minimum(error, np.float32(_MOST)), _BEFORE)
         brought = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         errors.append(_smooth(np.asarray(brought, np.float32), _AFTER) + np.float32(_NOISE))
