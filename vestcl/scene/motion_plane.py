@@ -1,9 +1,11 @@
 """The road as a plane: it gives a moving camera's pictures their metres, and pixels without parallax their depth."""
 
-from typing import Final
+import warnings
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from skimage.measure import ransac
 
 #: Where the road is looked for: below that share of the height, within that share of the width about the middle.
 _TOP, _BREADTH = 0.6, 0.7
@@ -14,8 +16,9 @@ _STRIDE: Final = 4
 #: The road leans to a side and up or down by less, as tangents: a camera is mounted level to about 10 degrees.
 _ROLL, _PITCH = 0.1, 0.25
 
-#: RANSAC's rounds; a third of the points on the road are found with 0.99999.
-_ROUNDS: Final = 400
+#: RANSAC's most rounds, with which a third of the points on the road are found with 0.99999; it stops once what it has
+#: found could be missed with less than that.
+_ROUNDS, _CERTAIN = 400, 0.99999
 
 #: On the plane: within so many standard deviations, which are no smaller than that share of the inverse depth.
 _INLIER, _SHARE = 2.0, 0.03
@@ -64,20 +67,40 @@ def fit_road(inverse: Array, std: Array, K: Array) -> Array | None:
         if on.sum() < max(_FEWEST, _ON_PLANE * len(s)):
             return None
         plane = np.asarray(np.linalg.lstsq(rays[on] / spread[on, None], s[on] / spread[on], rcond=None)[0], np.float64)
-    return plane if is_level(plane[None])[0] else None
+    return plane if _is_level(*plane.tolist()) else None
+
+
+class _Plane:
+    """A level plane as `skimage.measure.ransac` fits it, to rays and inverse depths in standard deviations."""
+
+    def __init__(self) -> None:
+        self.m: Array = np.zeros(3)
+
+    @classmethod
+    def from_estimate(cls, rays: Array, s: Array) -> Self | None:
+        """None where no level plane fits; scikit-image from 0.26 on."""
+        plane = cls()
+        return plane if plane.estimate(rays, s) else None
+
+    def estimate(self, rays: Array, s: Array) -> bool:
+        """Whether a level plane fits; scikit-image before 0.26."""
+        self.m = np.asarray(np.linalg.lstsq(rays, s, rcond=None)[0], np.float64)
+        return _is_level(*self.m.tolist())
+
+    def residuals(self, rays: Array, s: Array) -> Array:
+        """|1/z - m . K^-1 p| in standard deviations, [N]."""
+        return np.asarray(np.abs(rays @ self.m - s))
 
 
 def _ransac(rays: Array, s: Array, spread: Array) -> Array:
-    """The level plane through three points that most points are on."""
-    rng = np.random.default_rng(0)
-    triples = rng.integers(0, len(s), (_ROUNDS, 3))
-    # By the pseudo-inverse, which three points on a line have, too; what it gives for them is voted down.
-    planes: Array = np.asarray((np.linalg.pinv(rays[triples]) @ s[triples][..., None])[..., 0], np.float64)
-    counts = (np.abs(planes @ rays.T - s) < _INLIER * spread).sum(1) * is_level(planes)
-    return np.asarray(planes[counts.argmax()])
+    """m of the level plane through three points that most points are on; 0 where there is none."""
+    data = rays / spread[:, None], s / spread
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # no level plane
+        found, _ = ransac(data, _Plane, 3, _INLIER, max_trials=_ROUNDS, stop_probability=_CERTAIN, rng=0)
+    return np.zeros(3) if found is None else np.asarray(found.m, np.float64)
 
 
-def is_level(planes: Array) -> NDArray[np.bool_]:
-    """Which of the planes [N, 3] lie below the camera and lean no more than a road does."""
-    down = planes[:, 1]
-    return (down > 0) & (np.abs(planes[:, 0]) < _ROLL * down) & (np.abs(planes[:, 2]) < _PITCH * down)
+def _is_level(right: float, down: float, ahead: float) -> bool:
+    """Whether the plane m = (right, down, ahead) lies below the camera and leans no more than a road does."""
+    return down > 0 and abs(right) < _ROLL * down and abs(ahead) < _PITCH * down
