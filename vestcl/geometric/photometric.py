@@ -16,6 +16,7 @@ from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import sample
 from vestcl.scene.exposure import STRIDE, nearest, tone_curve
 from vestcl.scene.motion_plane import rays_of
+from vestcl.scene.regions import mean_by_region, superpixels
 
 Array = NDArray[np.float64]
 
@@ -46,8 +47,10 @@ _SEARCHED, _COMPARED, _FEWEST = 300, 1500, 30
 #: Of a thing's pixels so many must have been inside the frame before.
 _INSIDE: Final = 0.5
 
-#: Differences are averaged over windows of so many pixels.
-_WINDOW: Final = 5
+#: Differences are averaged over windows of so many pixels, then up to edges and over superpixels of that area. Against
+#: edges only, superpixels change PSNR at t+1, t+2 and t+3 by 0.00, 0.02 and 0.01 dB in the mean over 12 clips (23
+#: windows), on kitti_clip by 0.02, 0.07 and 0.05 dB.
+_WINDOW, _AREA = 5, 100.0
 
 
 class Pair(NamedTuple):
@@ -167,7 +170,8 @@ def confirmed(
     """v + g (c - v): ``velocity`` v, corrected to c as far as the pictures then look more alike.
 
     g = (d_v - d_c) / ((1 - LEFT) d_v + NOISE / 2), between 0 and 1, where d is the difference of both frames' colours
-    under a velocity, smoothed up to the picture's edges.
+    under a velocity: the mean of what it is when smoothed up to the picture's edges and when averaged over superpixels,
+    which keep to one depth, too.
 
     Args:
         corrected: c [3, H, W] m a frame, from `vestcl.geometric.objects.follow_flow`.
@@ -178,8 +182,10 @@ def confirmed(
     Returns:
         [3, H, W] m a frame.
     """
-    guide, pair = _check.pixels(pair.image), pair.equally_exposed(depth, velocity)
-    before, after = (smooth(guide, _difference(v, depth, pair)) for v in (velocity, corrected))
+    pair = pair.equally_exposed(depth, velocity)
+    guide, regions = _check.pixels(pair.image), superpixels(pair.image, depth, area=_AREA)
+    differences = (_difference(v, depth, pair) for v in (velocity, corrected))
+    before, after = ((smooth(guide, each) + mean_by_region(each, regions)) / 2 for each in differences)
     share = ((before - after) / ((1 - _LEFT) * before + _NOISE / 2)).clip(0, 1).astype(np.float32)
     return velocity + share * (corrected - velocity)
 
