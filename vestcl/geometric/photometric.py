@@ -91,7 +91,9 @@ class Pair(NamedTuple):
                 median tolerates.
         """
         grid = np.s_[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
-        points = rays_of(self.K, *depth.shape[1:])[grid] * depth[grid]
+        rows, columns = (np.arange(STRIDE // 2, size, STRIDE) + 0.5 for size in depth.shape[1:])
+        u, v = np.meshgrid(columns, rows)
+        points = np.tensordot(np.linalg.inv(self.K), np.stack([u, v, np.ones_like(u)]), 1) * depth[grid]
         points = (points if velocity is None else points - velocity[grid]).reshape(3, -1)
         x, y, z = self.K @ (self.prev_from_cur[:3, :3] @ points + self.prev_from_cur[:3, 3:])
         known = (depth[grid].ravel() > 0) & (z > 0.1)

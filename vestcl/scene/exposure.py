@@ -76,7 +76,7 @@ def curve_by_flow(image_prev: Array, image: Array, flow_uv: Array) -> ToneCurve:
         flow_uv: [2, H, W] px, from ``image`` to ``image_prev``.
     """
     grid = np.s_[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
-    rows, columns = np.mgrid[: image.shape[1], : image.shape[2]][grid]
+    columns, rows = np.meshgrid(*(np.arange(STRIDE // 2, size, STRIDE) for size in image.shape[:0:-1]))
     moved = flow_uv[grid] + np.stack([columns, rows])
     return tone_curve(nearest(image_prev, *moved).reshape(3, -1), image[grid].reshape(3, -1))
 
