@@ -137,7 +137,7 @@ def test_outside_of_the_image_nothing_is_decided() -> None:
 
 
 def test_errors_by_step() -> None:
-    """Flow needs a margin; of two tests later steps take the geometric mean; a candidate that loses once is held back."""
+    """Flow needs a margin; later steps take the mean of two tests; flow itself is held back if it loses one."""
     first, second = (np.full((5, 2, 2), value, np.float32) for value in (0.01, 0.04))
     once, later = by_step([first, second], monocular=False)
     np.testing.assert_allclose(once[:, 0, 0], [0.01, 0.01, 0.0125, 0.0125, 0.0125], rtol=1e-5)
