@@ -6,7 +6,7 @@ LOWEST := .venv-lowest
 OUT ?= out
 # Tests run in this many processes; a file's tests stay in one of them.
 TEST_PROCESSES ?= 2
-PYTEST_OPTIONS := -q -n $(TEST_PROCESSES) --dist loadfile
+PYTEST_OPTIONS := -q -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
 .PHONY: venv demo test lint test-lowest bench stress oclgrind devices-test clean
 

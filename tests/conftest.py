@@ -14,6 +14,13 @@ from vestcl import runtime
 
 torch.set_num_threads(2)
 
+#: Files whose tests take longest: two processes that begin with them end together.
+LONGEST = ("test_notebooks.py", "test_train_overfit.py", "test_train_ranks.py", "test_prepare_workers.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+
 
 def _devices() -> list[runtime.DeviceInfo]:
     wanted = os.environ.get("VESTCL_TEST_DEVICES", "")

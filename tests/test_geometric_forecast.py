@@ -290,3 +290,12 @@ def test_a_plain_video_beats_repeating_its_last_frame() -> None:
     shown = forecast_clip(flat, NOW, 1, [LEFT]).frames[0][LEFT.name].image
     truth, last = clip[NOW + 1].read_image(), clip[NOW].read_image()
     assert np.square(shown - truth).mean() < 0.5 * np.square(last - truth).mean()
+
+
+@pytest.mark.parametrize("without", [(NOW,), (NOW - 1,), (NOW - 2, NOW - 1)])
+def test_frames_without_depth_between_others(without: tuple[int, ...]) -> None:
+    """Where a scan is missing depth is from motion, and flow itself is a candidate, or is none, in all tests alike."""
+    clip = drive(PLAIN[0], start=PLAIN[1], samples=1).clip
+    known = [replace(sample, right=None, depth=None if i in without else sample.depth) for i, sample in enumerate(clip)]
+    made = forecast_clip(replace(clip, samples=tuple(known)), NOW, 2, [LEFT])
+    assert decibels(made.frames[0]["left"].image, clip[NOW + 1].read_image()) > 15

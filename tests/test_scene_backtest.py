@@ -79,8 +79,8 @@ def test_candidates_by_hand() -> None:
 
 
 def test_flow_itself_is_a_candidate_where_depth_is_from_motion() -> None:
-    frame = frames(2.0, 2.0, elapsed=2.0)[1]._replace(monocular=True)
-    positions, _ = candidates(frame, STILL, 3.0)
+    frame = frames(2.0, 2.0, elapsed=2.0)[1]
+    positions, _ = candidates(frame, STILL, 3.0, by_flow=True)
     np.testing.assert_allclose(positions[LINEAR][0], CENTRES[0] + 3.0, atol=1e-4)
     np.testing.assert_allclose(positions[LINEAR][1], CENTRES[1], atol=1e-4)
 
@@ -139,11 +139,11 @@ def test_outside_of_the_image_nothing_is_decided() -> None:
 def test_errors_by_step() -> None:
     """Flow needs a margin; later steps take the mean of two tests; flow itself is held back if it loses one."""
     first, second = (np.full((5, 2, 2), value, np.float32) for value in (0.01, 0.04))
-    once, later = by_step([first, second], monocular=False)
+    once, later = by_step([first, second], by_flow=False)
     np.testing.assert_allclose(once[:, 0, 0], [0.01, 0.01, 0.0125, 0.0125, 0.0125], rtol=1e-5)
     np.testing.assert_allclose(later[:, 0, 0], [0.02, 0.02, 0.025, 0.025, 0.025], rtol=1e-5)
-    assert len(by_step([first], monocular=True)) == 1 and by_step([], monocular=True) == ()
+    assert len(by_step([first], by_flow=True)) == 1 and by_step([], by_flow=True) == ()
     second[-1] *= 1.2
-    held = by_step([first, second], monocular=True)
+    held = by_step([first, second], by_flow=True)
     np.testing.assert_allclose(held[0][-1] / once[-1], 1.2**6, rtol=1e-4)
     np.testing.assert_allclose(held[0][:-1], once[:-1])

@@ -31,6 +31,8 @@ class Paths:
     errors: tuple[NDArray[np.float32], ...]
     """[C, H, W]: how wrong the candidates would have been, for the first step and for all later ones
     (`backtest.by_step`). Without any, points have their objects' velocities."""
+    by_flow: bool = False
+    """Whether flow itself is a candidate: where depth comes from motion."""
 
     def at(self, ahead: float, future_from_cur: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points [3, H, W] m in the camera after ``ahead`` intervals, which ``future_from_cur`` leads to."""
@@ -39,7 +41,7 @@ class Paths:
         if ahead <= 0 or not self.errors:
             points = rays * self.frame.depth + ahead * self.frame.velocity
             return np.tensordot(future_from_cur[:3, :3], points, 1) + future_from_cur[:3, 3, None, None]
-        positions, depth = backtest.candidates(self.frame, future_from_cur, ahead)
+        positions, depth = backtest.candidates(self.frame, future_from_cur, ahead, self.by_flow)
         errors = self.errors[0] if ahead <= 1 else self.errors[-1]
         u, v = backtest.mixed(positions, errors)
         return np.tensordot(np.linalg.inv(K), np.stack([u, v, np.ones_like(u)]), 1) * depth
@@ -52,7 +54,7 @@ def point_paths(perception: Perception, index: int) -> Paths:
         perception: of the clip.
         index: the frame, 0 or more.
     """
-    errors = []
+    errors, by_flow = [], perception.is_monocular(index)
     for back in _TESTED:
         first = index - back
         if first < 1 or any(perception.is_lost(i) for i in range(first, index + 1)):
@@ -60,11 +62,10 @@ def point_paths(perception: Perception, index: int) -> Paths:
         ahead = sum(perception.clip.elapsed(i) for i in range(first + 1, index + 1))
         camera = forecast_cameras(perception, first, [ahead], back)[0]
         before = perception.frame(first)
-        positions, _ = backtest.candidates(before, camera, ahead)
+        positions, _ = backtest.candidates(before, camera, ahead, by_flow)
         flows = [perception.correspondence(i).flow_uv for i in range(index, first, -1)]
         errors.append(backtest.backtest(positions, before, perception.image(index), flows))
-    frame = perception.frame(index)
-    return Paths(frame, backtest.by_step(errors, frame.monocular))
+    return Paths(perception.frame(index), backtest.by_step(errors, by_flow), by_flow)
 
 
 def forecast_cameras(

@@ -145,7 +145,7 @@ class Perception:
         if index == 0:
             return backtest.Frame(*asked, np.zeros_like(image[:2]), np.eye(4), K)
         motion = self.correspondence(index).flow_uv, self.prev_from_cur(index)
-        return backtest.Frame(*asked, *motion, K, self.clip.elapsed(index), self.is_monocular(index))
+        return backtest.Frame(*asked, *motion, K, self.clip.elapsed(index))
 
     def inverse_std(self, index: int) -> float:
         """Standard deviation of 1 / depth, 1/m."""

@@ -61,8 +61,6 @@ class Frame(NamedTuple):
     """[3, 3] px."""
     elapsed: float = 1.0
     """Intervals since the frame before."""
-    monocular: bool = False
-    """Whether depth comes from motion: it may then be far off, and so what is computed from it."""
 
 
 def residual_flow(frame: Frame) -> Array:
@@ -77,17 +75,21 @@ def residual_flow(frame: Frame) -> Array:
     return np.where(believed, residual, 0).astype(np.float32)
 
 
-def candidates(frame: Frame, future_from_cur: NDArray[np.float64], ahead: float) -> tuple[Array, Array]:
+def candidates(
+    frame: Frame, future_from_cur: NDArray[np.float64], ahead: float, by_flow: bool = False
+) -> tuple[Array, Array]:
     """Where each pixel's point may be after ``ahead`` intervals.
 
     The candidates: its object's velocity; rest in the world; rest and ``ahead`` times the residual flow r; rest and r
-    followed from place to place, as objects that come to the end of where r was seen slow down in the mean. Where
-    depth is from motion also, last, flow itself, p - ahead flow / elapsed, which knows of no depth.
+    followed from place to place, as objects that come to the end of where r was seen slow down in the mean. With
+    ``by_flow`` also, last, flow itself, p - ahead flow / elapsed: it knows of no depth, which may be far off where it
+    comes from motion.
 
     Args:
         frame: that is looked at.
         future_from_cur: [4, 4] m, the camera's forecast motion over that time.
         ahead: intervals of the clip, above 0.
+        by_flow: whether flow itself is one of them.
 
     Returns:
         [C, 2, H, W] px, and [H, W] m, the depth there by the first candidate.
@@ -96,7 +98,7 @@ def candidates(frame: Frame, future_from_cur: NDArray[np.float64], ahead: float)
     rest, _ = _project(frame, future_from_cur, np.zeros((3, 1, 1), np.float32))
     residual = residual_flow(frame)
     found = [by_object, rest, rest + ahead * residual, rest + _followed(residual, ahead)]
-    if frame.monocular:
+    if by_flow:
         found.append(pixel_centres(*frame.depth.shape[1:]) - frame.flow_uv * (ahead / frame.elapsed))
     return np.stack(found).astype(np.float32), np.maximum(z, _NEAREST).astype(np.float32)
 
@@ -129,19 +131,18 @@ def backtest(positions: Array, before: Frame, after: Array, flows: Sequence[Arra
     return np.stack(errors)
 
 
-def by_step(errors: Sequence[Array], monocular: bool) -> tuple[Array, ...]:
+def by_step(errors: Sequence[Array], by_flow: bool = False) -> tuple[Array, ...]:
     """Errors that count for the first step, and for all later ones: there the geometric mean over all tests.
 
     Those of candidates by flow are raised by `_FLOW_MARGIN`.
-    Flow itself, the last candidate of ``monocular`` frames, has its errors raised where it was worse than another over
-    the whole image in any test: by chance it does as well in places, and it forecasts what comes nearer worse with
-    every step.
+    Flow itself, with ``by_flow`` the last candidate, has its errors raised if it was worse than another over the whole
+    image in any test: by chance it does as well in places, and it forecasts what comes nearer worse with every step.
 
     Args:
         errors: of `backtest`, over one frame, over two ...
-        monocular: as `Frame` has it.
+        by_flow: as in `candidates`.
     """
-    if monocular:
+    if by_flow:
         means = [error.mean(axis=(1, 2)) for error in errors]
         worse = max([1.0, *(float(mean[-1] / mean[:-1].min()) for mean in means)])
         errors = [np.concatenate([error[:-1], error[-1:] * np.float32(worse**_WHOLE)]) for error in errors]
