@@ -26,7 +26,7 @@ def test_regions_do_not_cross_a_border_of_colour_or_depth(coloured: bool, deep: 
     box = np.zeros((HEIGHT, WIDTH), np.float32)
     box[30:70, 90:170] = 1
     share = mean_by_region(box, regions)
-    assert np.minimum(share, 1 - share).mean() < 0.01
+    assert np.minimum(share, 1 - share).mean() < 0.015  # a grid of squares: 0.06
 
 
 def test_labels_count_up_and_each_region_is_connected() -> None:
@@ -36,10 +36,10 @@ def test_labels_count_up_and_each_region_is_connected() -> None:
     assert label(regions + 1, connectivity=1).max() == regions.max() + 1
 
 
-@pytest.mark.parametrize("area", [100.0, 400.0, 1600.0])
+@pytest.mark.parametrize("area", [25.0, 100.0, 400.0])
 def test_regions_have_the_area_that_is_asked_for(area: float) -> None:
     count = superpixels(noise(blur=8.0), flat(20), area=area).max() + 1
-    assert 0.5 < HEIGHT * WIDTH / area / count < 2
+    assert 0.5 < HEIGHT * WIDTH * (208 / WIDTH) ** 2 / area / count < 2
 
 
 def test_a_wider_image_has_as_many_regions() -> None:
@@ -49,7 +49,7 @@ def test_a_wider_image_has_as_many_regions() -> None:
         superpixels(image.repeat(4, 1).repeat(4, 2), depth.repeat(4, 1).repeat(4, 2)),
     )
     assert wide.shape == (4 * HEIGHT, 4 * WIDTH)
-    assert 0.5 < (wide.max() + 1) / ((small.max() + 1) * (416 / WIDTH) ** 2) < 2
+    assert 0.5 < (wide.max() + 1) / (small.max() + 1) < 2
 
 
 def test_mean_by_hand() -> None:
