@@ -27,13 +27,13 @@ lint: venv
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy vestcl train
 
-# torch's OpenMP workers would spin on the cores that OpenCL's threads need.
+# torch's OpenMP workers would spin on the cores that OpenCL's threads need, and there is a process a core.
 test: lint
-	OMP_WAIT_POLICY=passive $(BIN)/pytest $(PYTEST_OPTIONS)
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/pytest $(PYTEST_OPTIONS)
 
 # The tests with the lowest versions that setup.py admits, on Python 3.10 or 3.11; torch is the same as in .venv.
 test-lowest: $(LOWEST)/.installed
-	OMP_WAIT_POLICY=passive $(LOWEST)/bin/pytest $(PYTEST_OPTIONS)
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(LOWEST)/bin/pytest $(PYTEST_OPTIONS)
 
 $(LOWEST)/.installed: setup.py constraints.txt tests/lowest_versions.py
 	$(PYTHON) -m venv $(LOWEST)

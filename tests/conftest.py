@@ -12,7 +12,7 @@ import torch
 
 from vestcl import runtime
 
-torch.set_num_threads(2)
+torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
 #: Files whose tests take longest: two processes that begin with them end together.
 LONGEST = ("test_notebooks.py", "test_train_overfit.py", "test_train_ranks.py", "test_prepare_workers.py")
