@@ -15,7 +15,8 @@ from vestcl.data import Street
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare_clip import prepare_clip
 
-#: dB that are to be reached, and updates that may be spent, 0.09 s each on one core: 36.2 were measured after 700, from 26.8.
+#: dB that are to be reached, and updates that may be spent, 0.09 s each on one core: 36.2 were measured after 700, from
+#: 26.8.
 #: What stands still follows the camera alone, so refinement has to learn most of it.
 WANTED, STEPS = 32.0, 400
 
