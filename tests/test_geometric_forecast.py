@@ -12,7 +12,8 @@ from geometric_scenes import HEIGHT, WIDTH, Matrix, decibels, drive, move, point
 from vestcl.data import intrinsics
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, View
-from vestcl.geometric.forecast import METHOD, _clouds, forecast_clip, forecast_frames
+from vestcl.geometric.forecast import METHOD, _clouds, forecast_clip, forecast_frames, show_frame
+from vestcl.geometric.paths import point_paths
 from vestcl.geometric.perception import Perception
 from vestcl.geometric.render import holes, show
 from vestcl.scene.correspondence import correspond
@@ -119,7 +120,7 @@ def test_what_the_frame_before_showed_is_at_its_place() -> None:
     """Its cloud alone, two frame intervals on: 4 dB and more better than itself again, where it shows
     anything and in the oncoming car."""
     clip, cameras = perception(*PASSING).clip, true_cameras(perception(*PASSING).clip)
-    before = _clouds(perception(*PASSING), NOW)[1](1, [np.eye(4), *cameras])
+    before = _clouds(seen := perception(*PASSING), NOW, point_paths(seen, NOW))[1](1, [np.eye(4), *cameras])
     shown = show([before], clip[NOW].K, np.eye(4), HEIGHT, WIDTH)
     seen, wanted = ~holes(shown)[0], clip[NOW + 1].read_image()
     assert seen.mean() > 0.5
@@ -148,7 +149,7 @@ def test_what_the_frame_before_showed_is_as_bright_as_the_current_one(gain: floa
     clip = perception(*PASSING).clip
     earlier = [replace(sample, image=Exposed(sample.image, gain)) for sample in clip.samples[:NOW]]
     jump = replace(clip, samples=(*earlier, *clip.samples[NOW:]))
-    before = _clouds(Perception(jump), NOW)[1](1, [np.eye(4)] * 2).image
+    before = _clouds(seen := Perception(jump), NOW, point_paths(seen, NOW))[1](1, [np.eye(4)] * 2).image
     wanted = clip[NOW - 1].read_image()
     unclipped = gain * wanted < 0.95
     assert np.abs(before - wanted)[unclipped].mean() < 0.01
@@ -299,3 +300,14 @@ def test_frames_without_depth_between_others(without: tuple[int, ...]) -> None:
     known = [replace(sample, right=None, depth=None if i in without else sample.depth) for i, sample in enumerate(clip)]
     made = forecast_clip(replace(clip, samples=tuple(known)), NOW, 2, [LEFT])
     assert decibels(made.frames[0]["left"].image, clip[NOW + 1].read_image()) > 15
+
+
+def test_the_backtest_is_a_stage_and_done_once() -> None:
+    """Two forecasts of a frame share it; the frame itself, shown from beside, needs none."""
+    clip = drive(PLAIN[0], start=PLAIN[1], samples=1).clip
+    shown = Perception(clip)
+    show_frame(shown, NOW, [RIGHT])
+    assert "backtest" not in shown.seconds
+    seen = Perception(clip)
+    seconds = [forecast_frames(seen, NOW, 1, [LEFT]).seconds["backtest"] for _ in range(2)]
+    assert 0 < seconds[0] == seconds[1]

@@ -67,7 +67,7 @@ def test_candidates_by_hand() -> None:
     frame = frame._replace(velocity=np.full_like(frame.velocity, 0) + np.float32([0.5, 0, 0])[:, None, None])
     ahead = np.eye(4)
     ahead[2, 3] = -2.0
-    positions, depth = candidates(frame, ahead, 2.0)
+    positions, depth = candidates(frame, residual_flow(frame), ahead, 2.0)
     assert len(positions) == 4
     np.testing.assert_allclose(depth, 8.0, atol=1e-5)
     middle = np.array([WIDTH / 2, HEIGHT / 2])[:, None, None]
@@ -80,7 +80,7 @@ def test_candidates_by_hand() -> None:
 
 def test_flow_itself_is_a_candidate_where_depth_is_from_motion() -> None:
     frame = frames(2.0, 2.0, elapsed=2.0)[1]
-    positions, _ = candidates(frame, STILL, 3.0, by_flow=True)
+    positions, _ = candidates(frame, residual_flow(frame), STILL, 3.0, by_flow=True)
     np.testing.assert_allclose(positions[LINEAR][0], CENTRES[0] + 3.0, atol=1e-4)
     np.testing.assert_allclose(positions[LINEAR][1], CENTRES[1], atol=1e-4)
 
@@ -88,7 +88,7 @@ def test_flow_itself_is_a_candidate_where_depth_is_from_motion() -> None:
 @pytest.mark.parametrize("ahead", [1.0, 2.0, 2.5])
 def test_at_a_place_motion_ends_where_the_flow_does(ahead: float) -> None:
     """The left half moves by 8 px an interval, and what crosses to the right half stops there."""
-    positions, _ = candidates(frames(8.0, 0.0)[1], STILL, ahead)
+    positions, _ = candidates(frame := frames(8.0, 0.0)[1], residual_flow(frame), STILL, ahead)
     far = positions[PLACE][0, :, :40]
     np.testing.assert_allclose(far, CENTRES[0, :, :40] + 8 * ahead, atol=1e-3)
     assert (positions[PLACE][0, :, :80] < WIDTH / 2 + 8).all() and positions[FLOW][0, :, 79].min() > WIDTH / 2 + 7

@@ -129,7 +129,7 @@ class PreparedPerception(Perception):
 
     def seen(self, index: int) -> Seen:
         """The frame's layers and objects."""
-        return self._once("layers", index, lambda: self._seen(index))
+        return self.once("layers", index, lambda: self._seen(index))
 
     def _seen(self, index: int) -> Seen:
         frame = self._frame_of(index)
@@ -137,4 +137,4 @@ class PreparedPerception(Perception):
         return Seen(frame.layers, objects_of, frame.velocity, frame.own)
 
     def _frame_of(self, index: int) -> Prepared:
-        return self._once("prepared frame", index, lambda: self._prepared.frame(index))
+        return self.once("prepared frame", index, lambda: self._prepared.frame(index))

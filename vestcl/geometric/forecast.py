@@ -96,7 +96,7 @@ def forecast_frames(
     cameras = forecast_cameras(perception, index, ahead) if future_from_cur is None else list(future_from_cur)
     if len(cameras) < steps:
         raise ValueError(f"`future_from_cur` must be of {steps} steps or more, got {len(cameras)}")
-    clouds = _clouds(perception, index)
+    clouds = _clouds(perception, index, point_paths(perception, index))
     start, frames = time.perf_counter(), list[dict[str, Rendered]]()
     for step in ahead:
         moved = [cloud(step, [np.eye(4), *cameras]) for cloud in clouds]
@@ -142,7 +142,7 @@ def show_frame(perception: Perception, index: int, views: Sequence[View]) -> dic
         ValueError: a clip that depth can't be had for.
     """
     clip = perception.clip
-    clouds = [cloud(0, [np.eye(4)]) for cloud in _clouds(perception, index)]
+    clouds = [cloud(0, [np.eye(4)]) for cloud in _clouds(perception, index, Paths(perception.frame(index)))]
     return {view.name: _render(clouds, clip[index].K if view.K is None else view.K, view, clip) for view in views}
 
 
@@ -150,12 +150,12 @@ MovingCloud = Callable[[int, list[NDArray[np.float64]]], Cloud]
 """A cloud at a step, given ``future_from_cur`` of all steps from 0."""
 
 
-def _clouds(perception: Perception, index: int) -> list[MovingCloud]:
+def _clouds(perception: Perception, index: int, paths: Paths) -> list[MovingCloud]:
     """What the current frame shows; what the one before did; what is behind the current foreground."""
     K = perception.clip[index].K
     cur, prev = perception.seen(index), perception.seen(index - 1)
     cur_from_prev = np.asarray(np.linalg.inv(perception.prev_from_cur(index)), np.float64)
-    shown = _shown(point_paths(perception, index), cur.own)
+    shown = _shown(paths, cur.own)
     since = cur_from_prev, perception.clip.elapsed(index)
     image_prev = as_exposed(prev.layers.image, cur.layers.image, perception.correspondence(index).flow_uv)
     before = _cloud(image_prev, prev.layers.depth, ~prev.own, K, prev.velocity, *since)
@@ -168,11 +168,11 @@ def _shown(paths: Paths, own: NDArray[np.bool_]) -> MovingCloud:
     """All pixels of the current frame; those of the recording car, ``own`` [1, H, W], stay in its camera's axes."""
     frame, (rows, columns) = paths.frame, np.indices(own.shape[1:]).reshape(2, -1)
     z_src = frame.depth.reshape(-1).astype(np.float32)
-    points = dict[int, NDArray[np.float32]]()
+    now, points = paths.at(0, np.eye(4)), dict[int, NDArray[np.float32]]()
 
     def points_at(step: int, future_from_cur: list[NDArray[np.float64]]) -> NDArray[np.float32]:
         if step not in points:
-            moved = np.where(own, paths.at(0, np.eye(4)), paths.at(step, future_from_cur[step]))
+            moved = np.where(own, now, paths.at(step, future_from_cur[step]))
             points[step] = np.ascontiguousarray(moved.reshape(3, -1).T, np.float32)
         return points[step]
 

@@ -1,5 +1,6 @@
 """Where the points of frame t will be: by the forecast motion of the camera, and the candidates that proved best."""
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -28,32 +29,39 @@ class Paths:
     """The points of all pixels of a frame, over time."""
 
     frame: backtest.Frame
-    errors: tuple[NDArray[np.float32], ...]
+    errors: tuple[NDArray[np.float32], ...] = ()
     """[C, H, W]: how wrong the candidates would have been, for the first step and for all later ones
     (`backtest.by_step`). Without any, points have their objects' velocities."""
     by_flow: bool = False
     """Whether flow itself is a candidate: where depth comes from motion."""
 
+    @functools.cached_property
+    def _residual(self) -> NDArray[np.float32]:
+        return backtest.residual_flow(self.frame)
+
     def at(self, ahead: float, future_from_cur: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points [3, H, W] m in the camera after ``ahead`` intervals, which ``future_from_cur`` leads to."""
-        K, (height, width) = self.frame.K, self.frame.depth.shape[1:]
-        rays = rays_of(K, height, width)
         if ahead <= 0 or not self.errors:
+            rays = rays_of(self.frame.K, *self.frame.depth.shape[1:])
             points = rays * self.frame.depth + ahead * self.frame.velocity
             return np.tensordot(future_from_cur[:3, :3], points, 1) + future_from_cur[:3, 3, None, None]
-        positions, depth = backtest.candidates(self.frame, future_from_cur, ahead, self.by_flow)
+        positions, depth = backtest.candidates(self.frame, self._residual, future_from_cur, ahead, self.by_flow)
         errors = self.errors[0] if ahead <= 1 else self.errors[-1]
         u, v = backtest.mixed(positions, errors)
-        return np.tensordot(np.linalg.inv(K), np.stack([u, v, np.ones_like(u)]), 1) * depth
+        return np.tensordot(np.linalg.inv(self.frame.K), np.stack([u, v, np.ones_like(u)]), 1) * depth
 
 
 def point_paths(perception: Perception, index: int) -> Paths:
     """The paths of frame ``index``'s points; candidates are tested on the two frames before it.
 
     Args:
-        perception: of the clip.
+        perception: of the clip; keeps the result.
         index: the frame, 0 or more.
     """
+    return perception.once("backtest", index, lambda: _tested_paths(perception, index))
+
+
+def _tested_paths(perception: Perception, index: int) -> Paths:
     errors, by_flow = [], perception.is_monocular(index)
     for back in _TESTED:
         first = index - back
@@ -62,7 +70,7 @@ def point_paths(perception: Perception, index: int) -> Paths:
         ahead = sum(perception.clip.elapsed(i) for i in range(first + 1, index + 1))
         camera = forecast_cameras(perception, first, [ahead], back)[0]
         before = perception.frame(first)
-        positions, _ = backtest.candidates(before, camera, ahead, by_flow)
+        positions, _ = backtest.candidates(before, backtest.residual_flow(before), camera, ahead, by_flow)
         flows = [perception.correspondence(i).flow_uv for i in range(index, first, -1)]
         errors.append(backtest.backtest(positions, before, perception.image(index), flows))
     return Paths(perception.frame(index), backtest.by_step(errors, by_flow), by_flow)
@@ -74,7 +82,7 @@ def forecast_cameras(
     """future_from_cur [4, 4] m after each of ``ahead`` intervals, from the last motions up to frame ``index``.
 
     ``back`` frames later the forecast is made that this one tests: motions before those that it looks at are left out,
-    so that nothing has to be looked at for the test alone.
+    so that nothing has to be looked at only for the test.
     """
     clip, seen = perception.clip, range(max(index + back - _MOTIONS + 1, 1), index + 1)
     motions = [np.linalg.inv(perception.prev_from_cur(i)) for i in seen]

@@ -107,21 +107,21 @@ class Perception:
 
     def image(self, index: int) -> NDArray[np.float32]:
         """[3, H, W]."""
-        return self._once("read", index, lambda: self.clip[index].read_image().copy())
+        return self.once("read", index, lambda: self.clip[index].read_image().copy())
 
     def correspondence(self, index: int) -> Correspondence:
         """From frame ``index`` to the one before."""
         if not 1 <= index < len(self.clip):
             raise ValueError(f"`index` must be 1 ... {len(self.clip) - 1}, a frame with one before, got {index}")
-        return self._once("flow", index, lambda: correspond(self.image(index), self.image(index - 1)))
+        return self.once("flow", index, lambda: correspond(self.image(index), self.image(index - 1)))
 
     def raw_depth(self, index: int) -> NDArray[np.float32]:
         """[1, H, W] m as it was measured, 0 = invalid."""
-        return self._once("depth", index, lambda: self._depth(index))
+        return self.once("depth", index, lambda: self._depth(index))
 
     def prev_from_cur(self, index: int) -> NDArray[np.float64]:
         """[4, 4] m: the camera's motion from frame ``index`` to the one before."""
-        return self._once("ego-motion", index, lambda: self._ego_motion(index))
+        return self.once("ego-motion", index, lambda: self._ego_motion(index))
 
     def is_lost(self, index: int) -> bool:
         """Whether the frame before is too far away in time to be matched, and there is a motion before that."""
@@ -132,11 +132,11 @@ class Perception:
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """M [1, H, W], True = static background."""
-        return self._once("mask", index, lambda: self._mask(index))
+        return self.once("mask", index, lambda: self._mask(index))
 
     def seen(self, index: int) -> Seen:
         """The frame's layers and things."""
-        return self._once("layers", index, lambda: self._see(index))
+        return self.once("layers", index, lambda: self._see(index))
 
     def frame(self, index: int) -> backtest.Frame:
         """The frame as candidate motions of its points are made and tested; at frame 0 nothing came from anywhere."""
@@ -154,7 +154,14 @@ class Perception:
             return _INVERSE_STD
         return _DISPARITY_STD / -float(sample.K[0, 0] * sample.right.right_from_left[0, 3])
 
-    def _once(self, stage: str, index: int, compute: Callable[[], Result]) -> Result:
+    def once(self, stage: str, index: int, compute: Callable[[], Result]) -> Result:
+        """``compute``'s result, kept with the frame's others; its time counts as the stage's.
+
+        Args:
+            stage: its name in ``seconds``.
+            index: the frame.
+            compute: called if the result is not there.
+        """
         key = (stage, index)
         with self._lock:
             if key not in self._kept:
@@ -225,7 +232,7 @@ class Perception:
         return sample.right is None or not sample.depth.metric
 
     def _combined(self, index: int) -> CombinedDepth:
-        return self._once("combined depth", index, lambda: self._combine(index))
+        return self.once("combined depth", index, lambda: self._combine(index))
 
     def _combine(self, index: int) -> CombinedDepth:
         sample, estimate = self.clip[index], self._given_depth(index)
@@ -248,14 +255,14 @@ class Perception:
         if len(self.clip) < 2:
             raise ValueError(f"{self.clip.name}: needs two frames, a right camera or depth, got one frame alone")
         if index == 0:  # nothing is before it, so what comes after has to do
-            return self._once("motion depth", 0, lambda: motion_depth([self.image(1), self.image(0)], self.clip[0].K))
+            return self.once("motion depth", 0, lambda: motion_depth([self.image(1), self.image(0)], self.clip[0].K))
         if self.is_lost(index):
             alone = [self.image(index)] * 2
-            return self._once("motion depth", index, lambda: motion_depth(alone, self.clip[index].K))
+            return self.once("motion depth", index, lambda: motion_depth(alone, self.clip[index].K))
         first = index - 1 if self.is_lost(index - 1) else max(index - 2, 0)
         images = [self.image(i) for i in range(first, index + 1)]
         known = self.correspondence(index)
-        return self._once("motion depth", index, lambda: motion_depth(images, self.clip[index].K, correspondence=known))
+        return self.once("motion depth", index, lambda: motion_depth(images, self.clip[index].K, correspondence=known))
 
     def _ego_motion(self, index: int) -> NDArray[np.float64]:
         if self.is_lost(index):

@@ -76,7 +76,7 @@ def residual_flow(frame: Frame) -> Array:
 
 
 def candidates(
-    frame: Frame, future_from_cur: NDArray[np.float64], ahead: float, by_flow: bool = False
+    frame: Frame, residual: Array, future_from_cur: NDArray[np.float64], ahead: float, by_flow: bool = False
 ) -> tuple[Array, Array]:
     """Where each pixel's point may be after ``ahead`` intervals.
 
@@ -87,6 +87,7 @@ def candidates(
 
     Args:
         frame: that is looked at.
+        residual: its `residual_flow`, r.
         future_from_cur: [4, 4] m, the camera's forecast motion over that time.
         ahead: intervals of the clip, above 0.
         by_flow: whether flow itself is one of them.
@@ -96,7 +97,6 @@ def candidates(
     """
     by_object, z = _project(frame, future_from_cur, ahead * frame.velocity)
     rest, _ = _project(frame, future_from_cur, np.zeros((3, 1, 1), np.float32))
-    residual = residual_flow(frame)
     found = [by_object, rest, rest + ahead * residual, rest + _followed(residual, ahead)]
     if by_flow:
         found.append(pixel_centres(*frame.depth.shape[1:]) - frame.flow_uv * (ahead / frame.elapsed))
@@ -171,7 +171,7 @@ def _project(
 
 
 def _followed(residual: Array, ahead: float) -> Array:
-    """[2, H, W] px: the way along ``residual`` px an interval, looked up anew after each interval or less."""
+    """[2, H, W] px: the way along ``residual`` px an interval, looked up again after each interval or less."""
     x, y = np.asarray(pixel_centres(*residual.shape[1:]) - 0.5, np.float32)
     steps = max(math.ceil(ahead - 1e-6), 1)
     way = np.zeros_like(residual)
