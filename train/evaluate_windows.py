@@ -21,9 +21,10 @@ from train.protocols import NOW, NOW_BORDER, Protocol, Source, currents
 from vestcl import network, peer
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
-from vestcl.geometric import Perception, forecast_frames, show_frame
+from vestcl.geometric import Perception, show_frame
 from vestcl.inputs import Inputs
 from vestcl.io.atomic import read_bytes, write_bytes
+from vestcl.later_frames import LaterFrames
 from vestcl.models.forecaster import Forecaster
 from vestcl.scoring import (
     GEOMETRIC,
@@ -39,6 +40,7 @@ from vestcl.scoring import (
     score,
     true_motion,
 )
+from vestcl.scoring.methods import Method, forecasts_of
 from vestcl.views import parse_view, parse_views
 
 #: Windows of a part: a minute or so of work, which is what a killed run may lose, and few enough parts to list.
@@ -223,8 +225,7 @@ def window(perceptions: Perception | Mapping[str, Perception], truth: Truth, ind
 
 
 def forecast(perception: Perception, index: int, views: Sequence[View], setup: Setup) -> dict[str, Timed]:
-    """The geometric forecast, then the peer's and each model's. All use what the first has seen, and are charged for
-    it; the peer only where other cameras than the source are asked for, which is all that it needs it for.
+    """The geometric forecast, then the peer's and each model's, see `forecasts_of`.
 
     Args:
         perception: of the clip.
@@ -232,20 +233,17 @@ def forecast(perception: Perception, index: int, views: Sequence[View], setup: S
         views: cameras.
         setup: models, peer, mode and steps.
     """
-    plain_made, whole = _timed(lambda: forecast_frames(perception, index, setup.steps, views))
-    looking = max(whole - plain_made.seconds["render"], 0.0)
-    made = {GEOMETRIC: Timed(plain_made, whole)}
-    if setup.peer is not None:
-        asked = (perception, setup.peer, index, setup.steps, views)
-        flat, seconds = _timed(functools.partial(peer.forecast_frames, *asked))
-        made[peer.METHOD] = Timed(flat, seconds + ("geometry" in flat.seconds) * looking)
-    for name, model in setup.models.items():
-        seen = (perception, model, index, setup.steps, views)
-        how = setup.later[name]
-        asked_for = functools.partial(network.forecast_frames, *seen, mode=how.mode, perceive=how.perceive)
-        own, seconds = _timed(asked_for)
-        made[name] = Timed(own, looking + seconds)
-    return made
+    models: dict[str, Method] = {
+        name: functools.partial(_network_forecasts, model, setup.later[name]) for name, model in setup.models.items()
+    }
+    return forecasts_of(perception, index, setup.steps, views, models, setup.peer)
+
+
+def _network_forecasts(
+    model: Forecaster, later: LaterFrames, perception: Perception, index: int, steps: int, views: Sequence[View]
+) -> Forecast:
+    how: dict[str, Any] = {"mode": later.mode, "perceive": later.perceive}
+    return network.forecast_frames(perception, model, index, steps, views, **how)
 
 
 def presenters(setup: Setup) -> dict[str, Presenter]:

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from vestcl.io.atomic import read_bytes
-from vestcl.io.strict_json import JsonError, parse_json
+from vestcl.io.strict_json import read_object
 
 Use = Literal["tuned", "checked"]
 
@@ -39,12 +38,7 @@ def read_list(path: Path) -> dict[str, Listed]:
     """
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
-    try:
-        content = parse_json(read_bytes(path))
-    except JsonError as error:
-        raise ValueError(f"{path}: is no JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: must be an object, by clip, got {type(content).__name__}")
+    content = read_object(path, wanted="an object, by clip")
     return {name: _listed(f"{path}: {name}", entry) for name, entry in content.items()}
 
 

@@ -118,7 +118,7 @@ def overviews(by_input: Mapping[str, Sequence[Record]], horizons: Sequence[int])
 
 
 def titled(name: str, use: str) -> str:
-    """ "kitti_clip (tuned)"; without a list of windows the name alone."""
+    """ "kitti_clip (tuned)"; without a list of windows only the name."""
     return f"{name} ({use})" if use else name
 
 

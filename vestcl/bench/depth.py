@@ -11,14 +11,14 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from vestcl import forecast_checks
 from vestcl.bench._results import plain, settings, write_json
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
+from vestcl.forecast_command import load_estimators
 from vestcl.geometric import Perception
 from vestcl.later_frames import DepthOf
 from vestcl.scene.depth import DepthScores, depth_scores
-from vestcl.scene.estimators import DepthEstimator, OnnxDepth, with_estimates
+from vestcl.scene.estimators import with_estimates
 
 #: What is compared.
 MOTION, NETWORK, COMBINED = "motion", "network", "combined"
@@ -63,7 +63,7 @@ def main(config: DepthBench) -> None:
     Raises:
         ValueError: an input that is no clip, has no depth to compare with, or no such frame; as the network's loader.
     """
-    network = None if config.depth_model is None else _network(config.depth_model)
+    network = load_estimators(config.depth_model, None).depth
     console, results = Console(), dict[str, Any]()
     for text in config.inputs:
         scores = evaluate(open_sequence(text), network, config)
@@ -109,14 +109,6 @@ def evaluate(clip: Clip, network: DepthOf | None, config: DepthBench) -> dict[st
         for name, depth in found.items():
             scores[name][index] = depth_scores(depth, true, crop=config.crop)
     return scores
-
-
-def _network(name: str) -> DepthOf:
-    is_file = forecast_checks.is_network_file("depth_model", name)
-    try:
-        return OnnxDepth.load(name) if is_file else DepthEstimator.load(name)
-    except ImportError as error:  # of the optional package; its message names the remedy
-        raise ValueError(str(error)) from error
 
 
 def _table(title: str, scores: dict[str, dict[int, DepthScores]]) -> Table:

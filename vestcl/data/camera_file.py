@@ -9,9 +9,8 @@ from typing import Any, Final, get_args
 from vestcl.data import calibration, fit
 from vestcl.data.calibration import Matrix
 from vestcl.data.lens import Distortion
-from vestcl.io.atomic import read_bytes
 from vestcl.io.labels import LabelKind
-from vestcl.io.strict_json import JsonError, parse_json
+from vestcl.io.strict_json import read_object
 
 #: Bytes of the largest camera.json that is read.
 _LARGEST: Final = 1 << 20
@@ -80,12 +79,7 @@ def read_camera(path: str | Path) -> CameraFile:
         ValueError: no such file, no JSON, a key that is missing or unknown, or a value out of range.
     """
     path = Path(path)
-    try:
-        content = parse_json(read_bytes(path, _LARGEST))
-    except JsonError as error:
-        raise ValueError(f"{path}: is no JSON ({error})") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: must be an object")
+    content = read_object(path, _LARGEST)
     _check_keys(path, content, (*_CAMERA, *_OTHERS))
     camera = _camera(path, content, content)
     right = content.get("right")

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from vestcl.data.resize import resize_labels
 from vestcl.forecast import Forecast, Rendered, View
+from vestcl.scene.motion_plane import rays_of
 from vestcl.scoring.pictures import SEEN, Truth
 
 #: The regions; a pixel belongs to the first that it fits.
@@ -85,8 +86,7 @@ def own_speed(
     x is the pixel's point in the source camera's axes at the frame's time, as ``motion_xyz`` has it.
     """
     height, width = frame.depth.shape[1:]
-    v, u = np.mgrid[:height, :width] + 0.5
-    points = np.linalg.inv(K) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1) * frame.depth.reshape(1, -1)
+    points = (rays_of(K, height, width) * frame.depth).reshape(3, -1)
     next_from_tgt, cur_from_next = np.linalg.inv(tgt_from_next), np.linalg.inv(next_from_cur)
     points = next_from_tgt[:3, :3] @ points + next_from_tgt[:3, 3:]
     static = points - (cur_from_next[:3, :3] @ points + cur_from_next[:3, 3:])

@@ -1,4 +1,4 @@
-"""NETWORK.json beside NETWORK.onnx: what the network wants to see, and what its output means. Read strictly.
+"""NETWORK.json next to NETWORK.onnx: what the network's input is, and what its output means. Read strictly.
 
 All keys may be absent. Of every network:
 
@@ -31,9 +31,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from vestcl.io.atomic import read_bytes
 from vestcl.io.labels import LAST_TRAIN_ID, VOID
-from vestcl.io.strict_json import JsonError, parse_json
+from vestcl.io.strict_json import read_object
 from vestcl.scene.estimators._class_tables import TABLES
 
 Kind = Literal["depth", "classes"]
@@ -97,7 +96,7 @@ def read_description(path: str | Path, kind: Kind) -> Description:
     """
     path = Path(path)
     file = path.with_suffix(".json")
-    content = _object(file) if (given := file.is_file()) else {}
+    content = read_object(file, _LARGEST) if (given := file.is_file()) else {}
     network = network_of(path)
     _check_keys(file, content, kind)
     return _description(file, content, kind, network, given)
@@ -111,7 +110,7 @@ def network_of(path: Path) -> Path:
     """
     network = path
     if path.suffix.lower() == ".json":
-        content = _object(path)
+        content = read_object(path, _LARGEST)
         named = _text(path, content, "file") if "file" in content else path.with_suffix(".onnx").name
         network = path.parent / named
     if not network.is_file():
@@ -145,16 +144,6 @@ def _check_together(file: Path, content: dict[str, Any], meaning: str) -> None:
         raise ValueError(f"{file}: meaning depth_m takes no offset; meaning disparity does")
     if "classes" in content and (wrong := {"movable", "sky"} & set(content)):
         raise ValueError(f"{file}: must have classes, or movable and sky, got classes and {min(wrong)}")
-
-
-def _object(file: Path) -> dict[str, Any]:
-    try:
-        content = parse_json(read_bytes(file, _LARGEST))
-    except JsonError as error:
-        raise ValueError(f"{file}: is no JSON ({error})") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{file}: must be an object, got {type(content).__name__}")
-    return content
 
 
 def _check_keys(file: Path, content: dict[str, Any], kind: Kind) -> None:
