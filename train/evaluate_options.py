@@ -18,7 +18,7 @@ class Evaluation:
     protocol: tyro.conf.Positional[Name]
     """Which clips, windows, cameras and size."""
     model: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
-    """A model's file, *.safetensors; more than one may be told. Tables call it by the file's stem."""
+    """A model's file, *.safetensors; more than one may be given. Tables call it by the file's stem."""
     data: Path | None = None
     """The data set's root, or for `clip` what `vestcl forecast` opens. `street` needs none."""
     prepared: Path | None = None

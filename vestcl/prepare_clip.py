@@ -85,7 +85,7 @@ def prepare_clip(
         clip: at the size wanted, two frames or more.
         folder: for this clip alone.
         inputs: where depth, masks, camera motion and inpainting come from, for clip.json; None reads it off the clip.
-        estimators: what tells the networks apart that estimate depth or classes for the clip, or inpaint.
+        estimators: a key of the networks that estimate depth or classes for the clip, or inpaint.
         inpaint: how the background is filled, see `vestcl.geometric.Perception`.
         wait: for another process that is at this clip.
         report: called after each frame.
@@ -206,7 +206,7 @@ def frame_keys(clip: Clip, estimators: str = "") -> list[str]:
 
     Args:
         clip: at the size wanted.
-        estimators: what tells the networks apart that estimate depth or classes, or inpaint.
+        estimators: a key of the networks that estimate depth or classes, or inpaint.
 
     Raises:
         ValueError: a file is missing.

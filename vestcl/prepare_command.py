@@ -197,14 +197,14 @@ def _cache(text: str, options: "cli.Prepare") -> Path:
 
 
 def estimators(options: "cli.Prepare") -> str:
-    """What tells the networks apart that the options name; nothing without any."""
+    """A key of the networks that the options name; empty without any."""
     models = (options.depth_model, options.mask_model, *((options.inpaint,) if options.inpaint else ()))
-    told = [*map(identity, models), *([COMBINED] if options.depth_model else [])]
-    return "|".join(told) if any(models) else ""
+    keys = [*map(identity, models), *([COMBINED] if options.depth_model else [])]
+    return "|".join(keys) if any(models) else ""
 
 
 def identity(model: str | None) -> str:
-    """What tells a network apart: its name on the hub, or its files with their sizes and times.
+    """A key of a network: its name on the hub, or its files with their sizes and times.
 
     Args:
         model: a folder, a file, "lama:FILE" or a name.
