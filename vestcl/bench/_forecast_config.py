@@ -33,7 +33,7 @@ class ForecastBench:
     every: int = 1
     """Take every such window."""
     first: int = 1
-    """The first window's current frame t, from 0; a frame stands before it."""
+    """The first window's current frame t, from 0; a frame is before it."""
     last: int | None = None
     """The last window's; without it the last one that has STEPS frames after it."""
     height: int = 256
