@@ -182,3 +182,17 @@ def test_missing_or_damaged_files_are_one_line(
         error = capsys.readouterr().err
         assert message in error and error.count("\n") == 1
     assert not network.calls and not (tmp_path / "out").exists()
+
+
+def test_figures_of_a_right_view_are_whole_in_a_narrow_terminal(
+    folder: Path,
+    tmp_path: Path,
+    geometric: Repeater,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    told = f"forecast {folder} --out {tmp_path} --no-exr --compare --steps 2 --view right"
+    assert cli.main(told.split()) == 0
+    table = capsys.readouterr().out.split("forecast: ")[0]
+    assert "oracle" in table and "\u2026" not in table

@@ -304,7 +304,7 @@ def _score_table(comparison: Comparison, later: LaterFrames | None) -> Table:
     mode = "" if later is None else f"; mode {later}"
     title = f"view {comparison.view}, mean over {count}{mode}{note}"
     table = Table(box=box.SIMPLE, title=title, title_justify="left", pad_edge=False)
-    table.add_column("", no_wrap=True)
+    table.add_column("")  # long names wrap, so that figures are never cut
     for heading in (*(f"t+{step}" for step in shown), "mean"):
         table.add_column(heading, justify="right", no_wrap=True)
     known = comparison.scores[compare.FORECAST][0]

@@ -24,7 +24,7 @@ Array = NDArray[np.float32]
 _SHARPNESS: Final = 3.0
 
 #: Flow has noise of its own, which rest and objects' velocities lack: to count alike its errors must be less by this.
-#: Of 1 and 1.25, 1.25 gains 0.6 dB where the camera is static (kitti_tracking_0006) and loses 0.3 in kitti_clip, at t+1.
+#: Of 1 and 1.25, 1.25 gains 0.6 dB where the camera rests (kitti_tracking_0006) and loses 0.3 in kitti_clip, at t+1.
 _FLOW_MARGIN: Final = 1.25
 
 #: Squared errors beyond are of something else, and noise of the camera that all have: 0.3 % of white.
