@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -14,6 +15,7 @@ from vestcl.data.kitti_odometry import open_kitti_odometry
 from vestcl.data.sample import Clip
 from vestcl.data.video import open_video
 from vestcl.io.labels import SKY
+from vestcl.scene import motion_pose
 from vestcl.scene.correspondence import correspond
 from vestcl.scene.ego_motion import constant_velocity
 from vestcl.scene.layers import SKY_DEPTH
@@ -70,6 +72,33 @@ def test_standing_still_is_said() -> None:
     assert not found.prev_from_cur[:3, 3].any() and not found.confidence.any()
     assert np.abs(found.prev_from_cur - np.eye(4)).max() < 1e-4
     assert off(found.depth, depth)[0, 3 * HEIGHT // 4 :, WIDTH // 2].max() < 0.05, "a level road is the guess"
+
+
+def test_a_car_that_crosses_before_a_camera_at_rest_has_the_depth_of_its_foot() -> None:
+    images, depth = drive(ahead(step=0.0))
+    noise = np.random.default_rng(1).uniform(0.1, 0.9, (3, 24, 60)).astype(np.float32).repeat(2, 1).repeat(2, 2)
+    rows = slice(HEIGHT // 2 - 8, HEIGHT // 2 + 40)  # from above the horizon down to the road
+    for i, image in enumerate(images):
+        image[:, rows, 40 + 5 * i : 160 + 5 * i] = noise
+    found = motion_depth(images, K)
+    last = slice(40 + 5 * (len(images) - 1) + 10, 160 + 5 * (len(images) - 1) - 10)
+    inside, foot = found.depth[0, rows.start + 6 : rows.stop - 6, last], depth[0, rows.stop, last].mean()
+    assert np.abs(inside / foot - 1).max() < 0.25 and np.abs(np.median(inside) / foot - 1) < 0.1
+    below = found.depth[0, 3 * HEIGHT // 4 + 20 :, WIDTH // 2]
+    assert np.abs(below / depth[0, 3 * HEIGHT // 4 + 20 :, WIDTH // 2] - 1).max() < 0.05, "the road keeps its depth"
+
+
+def test_a_wrong_start_does_not_decide_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    poses = ahead()
+    images, _ = drive(poses)
+    flow = correspond(images[-1], images[-2])
+    aside = np.eye(4)  # a turn and a step aside look much like a drive ahead
+    aside[:3, :3], aside[:3, 3] = cv2.Rodrigues(np.array([0.0, -0.02, 0.0]))[0], (0.95, 0.0, 0.3)
+    monkeypatch.setattr(motion_pose, "_five_points", lambda *args: aside)
+    found = motion_pose.relative_pose(flow, K).dst_from_src
+    true = np.linalg.inv(poses[-2]) @ poses[-1]
+    assert np.abs(found[:3, 3] - true[:3, 3] / np.linalg.norm(true[:3, 3])).max() < 0.05
+    assert np.abs(found[:3, :3] - true[:3, :3]).max() < 1e-3
 
 
 def test_pure_rotation_has_no_translation() -> None:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from vestcl.scene import _check, motion_fill
 from vestcl.scene.correspondence import Correspondence, correspond
 from vestcl.scene.layers import SKY_DEPTH
-from vestcl.scene.motion_measure import Measured, measure
+from vestcl.scene.motion_measure import Measured, measure, moving_by_turn
 from vestcl.scene.motion_plane import fit_road, rays_of
 from vestcl.scene.motion_pose import relative_pose
 from vestcl.scene.sky import sky_mask
@@ -82,10 +82,11 @@ def motion_depth(
     K = _check.matrix("K", K, 3)
     if not camera_height > 0:
         raise ValueError(f"`camera_height` must be above 0 m, got {camera_height}")
-    motion, measured = observe(pictures, K, correspondence)
+    flow = correspond(pictures[-1], pictures[-2]) if correspondence is None else correspondence
+    motion, measured = observe(pictures, K, flow)
     rays = rays_of(K, *pictures[-1].shape[1:])
     if measured is None:
-        nothing = Measured(rays[0] * 0, np.full_like(rays[0], np.inf), np.zeros(rays[0].shape, bool), [0.0])
+        nothing = Measured(rays[0] * 0, np.full_like(rays[0], np.inf), moving_by_turn(flow, motion, K), [0.0])
         return _complete(nothing, _ground(None, rays, camera_height), pictures[-1], motion)
     plane = fit_road(measured.inverse, measured.std, K)
     metres = _metres(measured, plane, camera_height)
@@ -135,7 +136,8 @@ def _ground(plane: Array | None, rays: Array, camera_height: float) -> Array:
 
 
 def _complete(measured: Measured, road: Array, image: NDArray[np.float32], motion: Array) -> MotionDepth:
-    things, feet, veiled = motion_fill.standing(measured.inverse, measured.std, measured.moving, road)
+    at_rest = not any(measured.lengths)
+    things, feet, veiled = motion_fill.standing(measured.inverse, measured.std, measured.moving, road, at_rest)
     std = np.where((things > 0) | measured.moving | veiled, np.inf, measured.std)
     inverse, spread = motion_fill.combine(np.maximum(measured.inverse, 0), std, road)
     inverse = np.where(things > 0, feet[things], inverse)

@@ -56,7 +56,7 @@ class Standing(NamedTuple):
     """[H, W], True above things, where their upper parts may be and what was measured may be theirs."""
 
 
-def standing(inverse: Array, std: Array, moving: NDArray[np.bool_], road: Array) -> Standing:
+def standing(inverse: Array, std: Array, moving: NDArray[np.bool_], road: Array, at_rest: bool = False) -> Standing:
     """Things that are farther than the road behind them by their flow, or leave their epipolar line: they move.
 
     A connected region of such pixels is one thing. It stands where its lowest pixels touch the road.
@@ -66,8 +66,9 @@ def standing(inverse: Array, std: Array, moving: NDArray[np.bool_], road: Array)
         std: [H, W] 1/m; infinite = unknown.
         moving: [H, W], what is off its line.
         road: [H, W] 1/m of the plane, below 0 above its horizon.
+        at_rest: whether the camera is: then ``moving`` is certain, above the horizon as well.
     """
-    found = (_behind(inverse, std, road) | moving) & (road > _ROAD_END)
+    found = moving.copy() if at_rest else (_behind(inverse, std, road) | moving) & (road > _ROAD_END)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(without_specks(found), connectivity=8)
     feet, things, veiled = [0.0], np.zeros(labels.shape, np.int32), np.zeros(labels.shape, bool)
     for label in range(1, count):
@@ -77,7 +78,10 @@ def standing(inverse: Array, std: Array, moving: NDArray[np.bool_], road: Array)
         box = np.s_[y : y + height, x : x + width]
         inside = _hull(labels[box] == label)
         lowest = height - 1 - inside[::-1].argmax(0)
-        feet.append(float(np.quantile(road[box][lowest, np.arange(width)], _FOOT)))
+        foot = float(np.quantile(road[box][lowest, np.arange(width)], _FOOT))
+        if foot <= _ROAD_END:
+            continue
+        feet.append(foot)
         things[box][inside] = len(feet) - 1
         above = np.s_[: y + height, x : x + width]
         veiled[above] |= (road[above] > -_TALL * feet[-1]) & (road[above] < _WAIST * feet[-1])

@@ -96,6 +96,19 @@ def measure(
     return Measured(mean, std, moving | (known & (mean < -_AGREE * std)), lengths)
 
 
+def moving_by_turn(correspondence: Correspondence, turn: Array, K: Array) -> NDArray[np.bool_]:
+    """[H, W], True where reliable flow differs from that of a camera that only turned: what moves there is no parallax.
+
+    Args:
+        correspondence: from the image to an earlier one.
+        turn: [4, 4], the camera's motion between them; its translation is not looked at.
+        K: [3, 3] px.
+    """
+    turned, _ = epipolar(K, turn, *correspondence.flow_uv.shape[1:])
+    off = np.hypot(*(moved_pixels(correspondence.flow_uv) - turned[:2] / np.maximum(turned[2], 1e-3)))
+    return np.asarray((correspondence.error[0] < _FLOW_ERROR) & (off > 2 * _OFF_LINE))
+
+
 def _texture(image: NDArray[np.float32]) -> Array:
     """Sums of products of the picture's derivatives over a window, xx, yy and xy: [3, H, W]."""
     grey = cv2.GaussianBlur(cv2.cvtColor(image.transpose(1, 2, 0), cv2.COLOR_RGB2GRAY), (0, 0), 1.0)

@@ -47,7 +47,9 @@ class Pose(NamedTuple):
 def relative_pose(correspondence: Correspondence, K: Array) -> Pose:
     """argmin over R, |t| = 1 of sum rho(x_dst^T [t]x R x_src / gradient), the Sampson distance with Cauchy's rho.
 
-    RANSAC over five points starts it. Where a turn alone explains the lower half of the picture, t = 0.
+    It has several minima, as a turn and a step aside look alike. So it is searched from what RANSAC over five points
+    finds and from a motion along the camera's axis, and the lowest is taken. Where a turn alone explains the lower half
+    of the picture, t = 0.
 
     Args:
         correspondence: from src to dst.
@@ -72,7 +74,9 @@ def relative_pose(correspondence: Correspondence, K: Array) -> Pose:
     start = _five_points(src_uv, dst_uv, K)
     if start is None:
         return Pose(np.eye(4), 0.0)
-    motion = _refine(start, src, dst, focal)
+    starts = start, rigid(turn, np.array([0.0, 0.0, 1.0]))
+    motion = min((_refine(each, src, dst, focal) for each in starts), key=lambda each: _cost(each, src, dst, focal))
+    motion = _in_front(motion, src, dst)
     off = np.abs(_sampson(motion, src, dst)) * focal
     return Pose(motion, float((off < _OFF_LINE).mean()))
 
@@ -133,6 +137,17 @@ def _refine(motion: Array, src: Array, dst: Array, focal: float) -> Array:
         weight = _cauchy(residual * focal, _BEND)
         motion = _nudged(motion, _solve(np.stack(columns, 1), residual, weight))
     return motion
+
+
+def _cost(motion: Array, src: Array, dst: Array, focal: float) -> float:
+    return float(np.log1p((_sampson(motion, src, dst) * focal / _BEND) ** 2).mean())
+
+
+def _in_front(motion: Array, src: Array, dst: Array) -> Array:
+    """``motion`` with the sign of its translation that has most points in front of the camera."""
+    turned, shift = src @ motion[:3, :3].T, motion[:3, 3]
+    inverse = -(np.cross(dst, turned) * np.cross(dst, shift)).sum(1)  # times |dst x t|^2, of dst ~ R src + t / z
+    return motion if np.median(inverse) >= 0 else rigid(cv2.Rodrigues(motion[:3, :3])[0][:, 0], -shift)
 
 
 def _nudged(motion: Array, step: Array) -> Array:
