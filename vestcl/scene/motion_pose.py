@@ -147,7 +147,9 @@ def _in_front(motion: Array, src: Array, dst: Array) -> Array:
     """``motion`` with the sign of its translation that has most points in front of the camera."""
     turned, shift = src @ motion[:3, :3].T, motion[:3, 3]
     inverse = -(np.cross(dst, turned) * np.cross(dst, shift)).sum(1)  # times |dst x t|^2, of dst ~ R src + t / z
-    return motion if np.median(inverse) >= 0 else rigid(cv2.Rodrigues(motion[:3, :3])[0][:, 0], -shift)
+    if np.median(inverse) >= 0:
+        return motion
+    return np.block([[motion[:3, :3], -shift[:, None]], [motion[3:]]])
 
 
 def _nudged(motion: Array, step: Array) -> Array:
