@@ -25,8 +25,9 @@ from vestcl.scene.inpainters import Inpainter, inpainter
 from vestcl.scene.layers import Layers, build_layers
 from vestcl.scene.lidar import densify
 from vestcl.scene.motion import backtest
+from vestcl.scene.motion.outline import whole_objects
 from vestcl.scene.motion_depth import MotionDepth, motion_depth
-from vestcl.scene.motion_mask import motion_mask
+from vestcl.scene.motion_mask import motion_mask, rigid_pixels
 from vestcl.scene.parallax import View, refine_depth
 from vestcl.scene.sky import sky_mask
 from vestcl.scene.stereo import stereo_depth
@@ -284,7 +285,12 @@ class Perception:
             return background(sample.read_labels())
         if index == 0:
             return np.ones((1, sample.height, sample.width), bool)
-        mask = motion_mask(self.raw_depth(index), self.correspondence(index), self.prev_from_cur(index), sample.K)
+        measured = self.correspondence(index), self.prev_from_cur(index), sample.K
+        mask = motion_mask(self.raw_depth(index), *measured)
+        if self.is_monocular(index):  # else depth outlines objects
+            rigid = rigid_pixels(self.raw_depth(index), sample.K, self.prev_from_cur(index))
+            pair = self.image(index), self.image(index - 1), self.correspondence(index)
+            mask = ~whole_objects(~mask[0], *pair, rigid)[None]
         return mask | sample.read_ego_vehicle() | self._sky(index, self.raw_depth(index))
 
     def _sky(self, index: int, depth: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:

@@ -9,9 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 from vestcl.scene import _check, motion_fill
 from vestcl.scene.correspondence import Correspondence, correspond
 from vestcl.scene.layers import SKY_DEPTH
+from vestcl.scene.motion.outline import whole_objects
 from vestcl.scene.motion_measure import Measured, measure, moving_by_turn
 from vestcl.scene.motion_plane import fit_road, rays_of
 from vestcl.scene.motion_pose import relative_pose
+from vestcl.scene.parallax import epipolar
 from vestcl.scene.sky import sky_mask
 
 #: Height of the camera above the road, metres, where none is told: behind the windscreen of a car. KITTI's is 1.65.
@@ -86,7 +88,10 @@ def motion_depth(
     motion, measured = observe(pictures, K, flow)
     rays = rays_of(K, *pictures[-1].shape[1:])
     if measured is None:
-        nothing = Measured(rays[0] * 0, np.full_like(rays[0], np.inf), moving_by_turn(flow, motion, K), [0.0])
+        turned, _ = epipolar(K, motion, *pictures[-1].shape[1:])
+        found = moving_by_turn(flow, motion, K)
+        moving = whole_objects(found, pictures[-1], pictures[-2], flow, turned[:2] / np.maximum(turned[2], 1e-3))
+        nothing = Measured(rays[0] * 0, np.full_like(rays[0], np.inf), moving, [0.0])
         return _complete(nothing, _ground(None, rays, camera_height), pictures[-1], motion)
     plane = fit_road(measured.inverse, measured.std, K)
     metres = _metres(measured, plane, camera_height)

@@ -56,9 +56,9 @@ _BODY_HERTZ: Final = (1.0, 1.7)
 _BODY_DAMPING: Final = (0.3, 0.6)
 _BODY_DEGREES: Final = (0.02, 0.05, 0.15, 0.4)
 
-#: The road's grade and banking: rms rate, degrees/s (a vertical curve of 250 m radius at 10 m/s has 2.3), and
+#: The road's grade and banking: rms rate, degrees/s (a vertical curve of 700 m radius at 10 m/s has 0.8), and
 #: correlation time, s.
-_ROAD_RATES: Final = (0.05, 0.2, 0.8, 2.5)
+_ROAD_RATES: Final = (0.05, 0.2, 0.8)
 _ROAD_SECONDS: Final = (0.5, 2.0)
 
 #: Acceleration: rms, m/s^2, from cruising to firm braking, and correlation time, s. Noise of a measured length, m.
