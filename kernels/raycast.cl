@@ -169,13 +169,22 @@ kernel void raycast(
     global float* restrict colour,               // [3, H, W] out
     global float* restrict depth,                // [1, H, W] out
     global uchar* restrict labels,               // [1, H, W] out
-    global int* restrict instances)              // [1, H, W] out
+    global int* restrict instances               // [1, H, W] out
+#ifdef BENT
+    , const int course_points,
+    global const course_t* restrict course       // [course_points]
+#endif
+    )
 {
   const int tile = get_global_id(0);
   const int y = tile / tile_columns * TILE + get_global_id(1), x0 = tile % tile_columns * TILE;
   if (y >= height) return;
   const scene_t scene = {view, solids, shadow_rects, cell_solids, cell_counts, crossings, solid_count, crossing_count,
-                         cell_rows, cell_columns};
+                         cell_rows, cell_columns,
+#ifdef BENT
+                         course, course_points,
+#endif
+  };
   global const ushort* listed = tile_solids + (size_t)tile * solid_count;
   const int lanes = min(LANES, width - x0), rays = samples * samples;
   const size_t plane = (size_t)height * width, at = (size_t)y * width + x0;

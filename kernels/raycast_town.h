@@ -59,8 +59,8 @@ static float markings(const scene_t* scene, float2 at, float2 footprint)
 static surface_t road(const scene_t* scene, const hit_t* hit)
 {
   global const view_t* view = scene->view;
-  const float2 at = hit->point.xz + (float2)(view->camera[0], view->camera[2]);
-  const float2 away = fabs(normalize(hit->point.xz));
+  const place_t place = place_of(scene, hit->point.xz);
+  const float2 at = place.at, away = place.away;
   const float2 footprint = hit->footprint * (1 + (hit->stretch - 1) * away);
   float3 colour = asphalt(at, footprint, view->lane, view->seed);
   const float paint = fabs(at.x) < view->kerb ? markings(scene, at, footprint) : 0;
@@ -77,8 +77,8 @@ static surface_t road(const scene_t* scene, const hit_t* hit)
 // Paving slabs behind a granite kerb.
 static surface_t pavement(const scene_t* scene, global const solid_t* solid, const hit_t* hit)
 {
-  const float2 at = hit->point.xz + (float2)(scene->view->camera[0], scene->view->camera[2]);
-  const float2 away = fabs(normalize(hit->point.xz));
+  const place_t place = place_of(scene, hit->point.xz);
+  const float2 at = place.at, away = place.away;
   const float2 footprint = hit->footprint * (1 + (hit->stretch - 1) * away);
   const float width = sqrt(footprint.x * footprint.y);
   const float inside = fabs(at.x) - scene->view->kerb;

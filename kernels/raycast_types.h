@@ -33,6 +33,16 @@ typedef struct {
   uint seed;
 } view_t;
 
+#ifdef BENT
+// A point of a bent street's middle line, COURSE_STEP metres along it from the one before.
+typedef struct {
+  float place[2];  // x and z from the camera, metres
+  float ahead[2];  // unit vector along the line
+  float curvature; // 1/m, positive to the right
+  float along;     // metres along the street
+} course_t;
+#endif
+
 // What a kernel knows of the scene: the solids and, per cell of a grid on the road, those whose shadow may fall there.
 typedef struct {
   global const view_t* view;
@@ -42,6 +52,10 @@ typedef struct {
   global const int* cell_counts;       // [rows * columns]
   global const float2* crossings;      // [crossings] z where a side street begins and ends
   int solid_count, crossing_count, cell_rows, cell_columns;
+#ifdef BENT
+  global const course_t* course;       // [course_points]
+  int course_points;
+#endif
 } scene_t;
 
 static float3 load3(global const float* a) { return (float3)(a[0], a[1], a[2]); }
@@ -55,3 +69,43 @@ static float3 to_world(global const solid_t* s, float3 p)
 {
   return (float3)(s->cos_yaw * p.x + s->sin_yaw * p.z, p.y, s->cos_yaw * p.z - s->sin_yaw * p.x);
 }
+
+// Where a point on the ground is on the street.
+typedef struct {
+  float2 at;    // metres to the right of the middle line, and along it
+  float2 away;  // |unit vector from the camera to the point|, across the street and along it
+} place_t;
+
+#ifdef BENT
+// The nearest of every COARSE-th point of the middle line, then Newton's steps: s += u / (1 - k v), with the point's u
+// ahead and v to the right of the line's.
+static place_t place_of(const scene_t* scene, float2 point)
+{
+  int best = 0;
+  float nearest = INFINITY;
+  for (int i = 0; i < scene->course_points; i += COARSE) {
+    const float2 apart = point - (float2)(scene->course[i].place[0], scene->course[i].place[1]);
+    if (dot(apart, apart) >= nearest) continue;
+    nearest = dot(apart, apart);
+    best = i;
+  }
+  float u = 0, v = 0, room = 1;
+  for (int k = 0; k < NEWTON; k++) {
+    best = clamp(best + (int)round(u / (room * COURSE_STEP)), 0, scene->course_points - 1);
+    global const course_t* c = scene->course + best;
+    const float2 apart = point - (float2)(c->place[0], c->place[1]);
+    u = apart.x * c->ahead[0] + apart.y * c->ahead[1];
+    v = apart.x * c->ahead[1] - apart.y * c->ahead[0];
+    room = max(1 - c->curvature * v, 0.3f);
+  }
+  global const course_t* c = scene->course + best;
+  const float2 unit = normalize(point);
+  const float2 turned = (float2)(unit.x * c->ahead[1] - unit.y * c->ahead[0], unit.x * c->ahead[0] + unit.y * c->ahead[1]);
+  return (place_t){(float2)(v - 0.5f * c->curvature * u * u / room, c->along + u / room), fabs(turned)};
+}
+#else
+static place_t place_of(const scene_t* scene, float2 point)
+{
+  return (place_t){point + (float2)(scene->view->camera[0], scene->view->camera[2]), fabs(normalize(point))};
+}
+#endif

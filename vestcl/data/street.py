@@ -2,6 +2,7 @@
 
 World axes: x right, y down, z forward along the road, metres; the road is y = 0 and its centre line x = 0. Traffic
 keeps right, and never ends: see vestcl/data/layout.py and street_traffic.py. How the camera drives: street_drive.py.
+With a `RoadDrive` the street bends along its course: what is said of x and z holds across it and along it.
 """
 
 from dataclasses import dataclass
@@ -10,11 +11,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.data import layout
+from vestcl.data import calibration, layout, street_bent
 from vestcl.data.layout import BLOCK, CROSSING, Layout
-from vestcl.data.raycast import FOREGROUND, SOLID, Frame, Label, Material, Scene, blank_frame, cast
+from vestcl.data.raycast import FOREGROUND, SOLID, Frame, Label, Material, Scene, Solids, blank_frame, cast
 from vestcl.data.street_camera import check_cameras, check_pose, check_samples, intrinsics
+from vestcl.data.street_course import Course
 from vestcl.data.street_drive import Drive, Recording, Sway, world_from_camera
+from vestcl.data.street_road import RoadDrive
 from vestcl.data.street_traffic import Mover, Traffic
 
 if TYPE_CHECKING:  # it needs torch, which takes seconds to import
@@ -85,10 +88,18 @@ class Street:
         """From the centre line to the kerb, metres."""
         return self.lane + self.parking
 
+    @property
+    def course(self) -> Course | None:
+        """The way of a bent street; None is straight."""
+        return self.drive.course if isinstance(self.drive, RoadDrive) else None
+
     def camera_pose(self, t: float) -> NDArray[np.float64]:
         """world_from_camera [4,4] at time ``t`` seconds: along the right lane, as `drive` moves."""
         ahead, aside, down, *turn = self.drive.at(t)
-        return world_from_camera(self.lane / 2 + aside, down - CAMERA_HEIGHT, ahead, *turn)
+        if self.course is None:
+            return world_from_camera(self.lane / 2 + aside, down - CAMERA_HEIGHT, ahead, *turn)
+        relative = world_from_camera(self.lane / 2 + aside, down - CAMERA_HEIGHT, 0.0, *turn)
+        return street_bent.world_from_street(self.course, ahead) @ relative
 
     def render(
         self,
@@ -170,7 +181,13 @@ class Street:
         displacement = np.stack([frame.depth[0, 0] * (a * u + (b * v + c)) for a, b, c in per_metre])
         displacement += np.where(frame.labels[0] == Label.SKY, 0.0, next_from_cur[:3, 3, None, None])
         moving = frame.instances[0, 0] > 0
-        moved = self._displacements(cur, frame.instances[0, 0][moving], float(times[0]), float(times[1]))
+        names, span = frame.instances[0, 0][moving], (float(times[0]), float(times[1]))
+        if self.course is None:
+            moved = self._displacements(cur, names, *span)
+        else:
+            rows, columns = np.nonzero(moving)
+            seen = np.linalg.inv(cameras[0]) @ np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+            moved = self._bent_displacements(cur, names, seen * frame.depth[0, 0][moving], *span)
         displacement[:, moving] += after[:3, :3] @ moved
         return displacement.astype(np.float32)
 
@@ -207,8 +224,33 @@ class Street:
         names, ways = np.array([name for name, _ in rows], np.int32), np.array([way for _, way in rows]).reshape(-1, 3)
         return ways[np.searchsorted(names, instances)].T
 
+    def _bent_displacements(
+        self,
+        camera_from_world: NDArray[np.float64],
+        instances: NDArray[np.int32],
+        points_xyz: NDArray[np.float64],
+        t_cur: float,
+        t_next: float,
+    ) -> NDArray[np.float64]:
+        """The same for points [3,N] in the camera's axes: on a bent street cars turn as well."""
+        assert self.course is not None
+        traffic, moved = self._traffic(), np.zeros_like(points_xyz)
+        world = camera_from_world[:3, :3].T @ (points_xyz - camera_from_world[:3, 3:])
+        for mover in traffic.movers(t_cur, *self._stretch(camera_from_world)):
+            of_it = instances == mover.instance
+            if of_it.any():
+                places = [
+                    street_bent.world_from_street(self.course, z) @ calibration.translation((0.0, y, 0.0))
+                    for _, y, z in (mover.position, traffic.position(mover, t_next))
+                ]
+                next_from_cur = places[1] @ np.linalg.inv(places[0])
+                moved[:, of_it] = (next_from_cur[:3, :3] - np.eye(3)) @ world[:, of_it] + next_from_cur[:3, 3:]
+        return moved
+
     def _stretch(self, camera_from_world: NDArray[np.float64]) -> tuple[float, float]:
-        """The z in metres between which the street is built for a camera."""
+        """The z in metres between which the street is built for a camera; along it where it is bent."""
+        if self.course is not None:
+            return street_bent.stretch(self.course, camera_from_world, AHEAD, BEHIND)
         rotation = camera_from_world[:3, :3]
         z, forward = float(-rotation[:, 2] @ camera_from_world[:3, 3]), rotation[2, 2]
         return z - (BEHIND if forward > 0.5 else AHEAD), z + (BEHIND if forward < -0.5 else AHEAD)
@@ -218,6 +260,23 @@ class Street:
         low, high = self._stretch(camera_from_world)
         plan, blocks = self._plan(), range(int(low // BLOCK), int(high // BLOCK) + 1)
         movers: list[Mover] = list(self._traffic().movers(t, low, high)) if foreground else []
+        if self.course is not None:
+            solids = street_bent.solids(self.course, plan, blocks, movers, position)
+        else:
+            solids = self._straight_solids(plan, blocks, movers, position)
+        if not foreground:
+            solids = solids[~np.isin(solids["label"], FOREGROUND)]
+        # Leaves last: their noise is looked up only where nothing nearer was hit.
+        solids = solids[np.argsort(solids["material"] == Material.FOLIAGE, kind="stable")]
+        ends = [(index + 1) * BLOCK for index in blocks if layout.has_crossing(self.seed, index)]
+        crossings = np.array([(end - CROSSING, end) for end in ends], np.float32).reshape(-1, 2)
+        course = None if self.course is None else street_bent.points(self.course, low, high, position)
+        return Scene(solids, crossings, self.sun, self.lane, self.kerb, self.seed, course)
+
+    def _straight_solids(
+        self, plan: Layout, blocks: range, movers: list[Mover], position: NDArray[np.float64]
+    ) -> Solids:
+        """Everything in ``blocks`` and all ``movers``, placed from ``position``."""
         parts = [*(layout.block(plan, index) for index in blocks), *(mover.solids for mover in movers)]
         offsets = [*((0.0, 0.0, index * BLOCK) for index in blocks), *(mover.position for mover in movers)]
         # As plain bytes, because NumPy compares the fields' names of all parts, which takes a millisecond.
@@ -225,13 +284,7 @@ class Street:
         counts = [len(part) for part in parts]
         solids["centre"] += np.repeat(np.array(offsets) - position, counts, axis=0)
         solids["instance"] = np.repeat([*(0 for _ in blocks), *(mover.instance for mover in movers)], counts)
-        if not foreground:
-            solids = solids[~np.isin(solids["label"], FOREGROUND)]
-        # Leaves last: their noise is looked up only where nothing nearer was hit.
-        solids = solids[np.argsort(solids["material"] == Material.FOLIAGE, kind="stable")]
-        ends = [(index + 1) * BLOCK for index in blocks if layout.has_crossing(self.seed, index)]
-        crossings = np.array([(end - CROSSING, end) for end in ends], np.float32).reshape(-1, 2)
-        return Scene(solids, crossings, self.sun, self.lane, self.kerb, self.seed)
+        return solids
 
     def _plan(self) -> Layout:
         return Layout(self.seed, self.kerb, self.pavement)

@@ -1,7 +1,8 @@
-"""How the street's camera drives: a smooth sway of its own, or the wobble of a real recording.
+"""How the street's camera drives: a smooth sway of its own, the wobble of a real recording, or as cars do.
 
 A drive is six numbers at every time: metres along the road, to the right of the lane's middle and below the camera's
-usual height, and the radians yaw (right), pitch (up) and roll (clockwise) of world_from_camera = Ry Rx Rz.
+usual height, and the radians yaw (right), pitch (up) and roll (clockwise) of world_from_camera = Ry Rx Rz. Of a
+`RoadDrive` (street_road.py) they are relative to its course, which may bend.
 """
 
 import functools
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.data.street_camera import check_pose
+from vestcl.data.street_road import RoadDrive
 
 Array = NDArray[np.float64]
 Wave = tuple[float, float]
@@ -190,7 +192,7 @@ class Recording:
         return self.frames[-1][0] / (len(self.frames) - 1) * RECORDED_FPS
 
 
-Drive = Sway | Recording
+Drive = Sway | Recording | RoadDrive
 
 
 def world_from_camera(x: float, y: float, z: float, yaw: float, pitch: float, roll: float) -> Array:
