@@ -21,7 +21,7 @@ from vestcl.prepared import PreparedClip
 from vestcl.scoring import GEOMETRIC, METRICS, Grid, horizon, number, to_markdown
 
 #: A procedural street's name in a clip.
-_STREET: Final = re.compile(r"street (\d+)")
+_STREET: Final = re.compile(r"street (\d+)(?: .*)?")
 
 #: Speeds and turns are told from this to that percentile.
 _RANGE: Final = (5, 95)
@@ -157,6 +157,8 @@ def prepare_commands(config: Config) -> list[str]:
     for data in dict.fromkeys(config.data_of(stage) for stage in config.stages):
         clips = list(window_set(data).clips)
         streets = [f"street:{numbers}" for numbers in _seeds(clips).split(", ") if numbers != "-"]
+        if any("=" in clip.name for clip in clips):  # the configuration lists the command that drew them
+            streets = []
         height, width = clips[0].size
         random = " --drive random" if streets and _is_random(clips[0]) else ""
         sizes = f"--height {height} --width {width} --frames {max(map(len, clips))}{random}"
@@ -168,7 +170,7 @@ def prepare_commands(config: Config) -> list[str]:
 def _is_random(clip: PreparedClip) -> bool:
     """Whether a street's clip starts elsewhere than the street's own driving does."""
     found, pose = _STREET.fullmatch(clip.name), clip.world_from_cam(0)
-    if found is None or pose is None:
+    if found is None or pose is None or "=" in clip.name:
         return False
     usual = Street.generate(int(found[1])).camera_pose(0.0)
     return bool(np.abs(usual[:3, 3] - pose[:3, 3]).max() > _SAME_PLACE)

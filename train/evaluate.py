@@ -35,6 +35,7 @@ from train.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
 from vestcl import __version__, command_line, interrupt, options, peer, runtime
 from vestcl.bench import _results
+from vestcl.data import street_input
 from vestcl.inputs import Inputs
 from vestcl.io.atomic import write_bytes
 from vestcl.metrics import MS_SSIM_SIDE
@@ -161,7 +162,11 @@ def _where(config: Evaluation, protocol: Protocol) -> Where:
     if first > last:
         raise ValueError(f"`seeds` must be from a lower to a higher one, got {config.seeds}")
     seeds = range(first, last + 1)
-    return Where(config.data, seeds, protocol.size, frames, config.samples, config.prepared, config.accumulated_depth)
+    fps = None if config.street_fps is None else street_input.rate(str(config.street_fps), "`street_fps`")
+    driven = street_input.Driven(None if config.drive == "usual" else config.drive, fps)
+    return Where(
+        config.data, seeds, protocol.size, frames, config.samples, config.prepared, config.accumulated_depth, driven
+    )
 
 
 def _caveats(config: Evaluation, setup: Setup) -> list[str]:

@@ -28,6 +28,9 @@ _NOT_IN_KEY: Final = (
     "sheets",
 )
 
+#: Settings of later versions, with what changes nothing.
+_LATER: Final = {"drive": "usual", "street_fps": None}
+
 #: Of the scores' files: raised when what a window is given or how it is scored changes.
 _SCORING: Final = 3
 
@@ -43,6 +46,7 @@ def about_run(config: Evaluation, protocol: Protocol) -> dict[str, Any]:
         FileNotFoundError: no such model or weights.
     """
     settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_IN_KEY}
+    settings = {k: v for k, v in settings.items() if k not in _LATER or v != _LATER[k]}  # keys of former runs hold
     folders = {name: getattr(config, name) for name in ("data", "prepared")}
     changed = {name: None if folder is None else str(folder.resolve()) for name, folder in folders.items()}
     effective = {k: getattr(protocol, k) for k in ("size", "steps", "first", "last")}

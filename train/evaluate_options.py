@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -68,6 +69,10 @@ class Evaluation:
     end in "stereo pair"; where the right camera's future is judged they come next to monocular ones."""
     seeds: tuple[int, int] = (HELD_OUT[0], HELD_OUT[-1])
     """Of streets: the first and the last."""
+    drive: Literal["usual", "road"] = "usual"
+    """How cameras drive down streets: as the street has it, or with bends, braking, stops and a body on springs."""
+    street_fps: float | None = None
+    """Frames a second of streets; without it 10."""
     samples: int = 2
     """Rays a pixel and direction, of streets."""
     shard: str | None = None

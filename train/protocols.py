@@ -22,12 +22,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from vestcl.data import street_input
 from vestcl.data.cityscapes import open_cityscapes, snippets
 from vestcl.data.kitti_raw import open_kitti_raw
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.splits import CONTEXT, FUTURE, KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL
-from vestcl.data.street import Street
 from vestcl.prepared import PreparedClip, find_prepared
 from vestcl.prepared_perception import as_clip
 from vestcl.scoring import RIGHT, SOURCE
@@ -80,6 +80,8 @@ class Where:
     """Folder of prepared clips, in place of ``data``."""
     accumulated_depth: bool = False
     """Of KITTI raw: depth from `proj_depth/groundtruth`, which has the scans of later frames, too."""
+    driven: street_input.Driven = street_input.USUAL
+    """How streets are driven."""
 
     def root(self) -> Path:
         """``data``.
@@ -188,13 +190,15 @@ def _cityscapes(where: Where) -> list[Source]:
 
 def _streets(where: Where) -> list[Source]:
     _check_unaccumulated(where)
+    about = where.driven.named()
+    names = {seed: f"street {seed} {about}".rstrip() for seed in where.seeds}
     if where.prepared is not None:
-        return _prepared(where, [f"street {seed}" for seed in where.seeds])
+        return _prepared(where, list(names.values()))
 
     def street(seed: int) -> Clip:
-        return Street.generate(seed).clip(where.frames, *where.size, samples=where.samples)
+        return street_input.clip(seed, where.driven, where.frames, where.size, where.samples, about)
 
-    return [Source(f"street {seed}", functools.partial(street, seed)) for seed in where.seeds]
+    return [Source(name, functools.partial(street, seed)) for seed, name in names.items()]
 
 
 def _sequence(where: Where) -> list[Source]:

@@ -107,7 +107,7 @@ class Forecast:
 
     input: tyro.conf.Positional[str]
     """A KITTI raw drive, a KITTI odometry sequence, a frame of Cityscapes, a scene of Virtual KITTI 2, a folder with
-    camera.json, a video, or street:SEED for a procedural street."""
+    camera.json, a video, or street:SEED for a procedural street (street:7?drive=road,fps=25 with bends, at 25 Hz)."""
     out: Path = Path("out")
     """Folder for the files; those of an earlier forecast are replaced one by one."""
     steps: int = 5
@@ -194,7 +194,8 @@ class Prepare:
     """
 
     inputs: tyro.conf.Positional[tuple[str, ...]]
-    """Clips, as `vestcl forecast` opens them, or procedural streets: street:SEED, street:FIRST-LAST."""
+    """Clips, as `vestcl forecast` opens them, or procedural streets: street:SEED, street:FIRST-LAST, with
+    options or without: street:7?drive=road,fps=12.5,depth=stereo,masks=motion."""
     out: Path | None = None
     """Folder of the cache; a folder in it for each clip. Without it: .vestcl in each input."""
     height: int = 256
@@ -205,11 +206,18 @@ class Prepare:
     """Frames of each street."""
     samples: int = 2
     """Streets' colour is the mean over samples x samples rays a pixel."""
-    drive: Literal["usual", "random"] = "usual"
-    """How cameras drive down streets: as the street has it, or drawn at random in the ranges of real cars, from a
-    random time on."""
-    street_depth: Literal["true", "stereo"] = "true"
-    """Where streets' depth comes from: the street itself, or as on the road the matching of its stereo pairs."""
+    drive: Literal["usual", "random", "road"] = "usual"
+    """How cameras drive down streets: as the street has it; the same, but drawn at random in the ranges of real cars,
+    from a random time on; or with bends, braking, stops and a body on springs. This and the next three are for streets
+    whose input does not list them itself."""
+    street_depth: Literal["true", "stereo", "motion", "scan", "random"] = "true"
+    """Where streets' depth comes from: the street itself, or as on the road the matching of its stereo pairs, the
+    camera's motion, or simulated laser scans; random draws one of the latter three for each street."""
+    street_masks: Literal["true", "motion", "disturbed", "random"] = "true"
+    """Where streets' masks come from: true labels, motion, or labels with a classifier's errors; random draws one of
+    the latter two for each street."""
+    street_fps: str | None = None
+    """Frames a second of streets, or random: 8 to 30. Without it 10."""
     shard: str | None = None
     """I/N, I from 0: every N-th clip from the I-th on. Without it what torchrun tells, if it started this."""
     workers: int = 1

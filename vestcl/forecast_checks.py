@@ -4,14 +4,12 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from vestcl.data import street_input
 from vestcl.options import check_pixels
 
 if TYPE_CHECKING:
     from vestcl import cli
     from vestcl.data.sample import Clip
-
-#: An input that is no file: the procedural street of this seed.
-STREET: Final = re.compile(r"street:(\d{1,18})")
 
 #: What an input is not, though it looks like one that vestcl could open.
 _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://.*", re.DOTALL)
@@ -32,8 +30,18 @@ def check_input(text: str) -> None:
     """
     if _URL.fullmatch(text):
         raise ValueError(f"{text}: is a URL, and vestcl opens files only: download it first")
-    if text.startswith("street:") and not STREET.fullmatch(text) and not Path(text).exists():
+    if text.startswith("street:") and one_street(text) is None and not Path(text).exists():
         raise ValueError(f"{text}: must be street:SEED, as street:3 (prepare takes street:FIRST-LAST, too)")
+
+
+def one_street(text: str) -> street_input.StreetInput | None:
+    """The procedural street that an input names, which is no file; None for any other text, or several streets.
+
+    Raises:
+        ValueError: an option that a street does not have.
+    """
+    street = street_input.parse(text)
+    return street if street is not None and street.seeds is not None and "-" not in text.partition("?")[0] else None
 
 
 def check_file_options(options: "cli.Forecast | cli.Prepare") -> None:

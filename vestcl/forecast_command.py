@@ -17,10 +17,10 @@ from rich.text import Text
 
 from vestcl import compare, forecast_checks, forecast_files, pretrained, quality, runtime, sheet
 from vestcl.compare import Comparison
+from vestcl.data import street_input
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Skipped, View
-from vestcl.forecast_checks import STREET
 from vestcl.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
 from vestcl.models.trunks import load_trunk
 from vestcl.options import check_pixels
@@ -139,14 +139,14 @@ def open_clip(options: "cli.Forecast", estimators: Estimators | None = None) -> 
     """
     forecast_checks.check_input(options.input)
     estimators = estimators or load_estimators(options.depth_model, options.mask_model)
-    street = STREET.fullmatch(options.input)
+    street = forecast_checks.one_street(options.input)
     beside = {name: getattr(options, name) for name in _BESIDE}
     layout = {name: getattr(options, name) for name in _LAYOUT if getattr(options, name) not in (None, False)}
-    if street:
+    if street is not None and street.seeds is not None:
         wrong = [*layout, *(name for name, unset in _BESIDE.items() if beside[name] != unset)]
         if wrong:
             raise ValueError(f"{options.input}: is a street, which takes height, width, not {', '.join(wrong)}")
-        return with_estimates(_street(int(street[1]), options), estimators)
+        return with_estimates(_street(street.seeds[0], street.driven, options), estimators)
     forecast_checks.check_folders(options)
     clip = _resized(open_sequence(options.input, **beside, **layout), options.height, options.width)
     return with_estimates(clip, estimators)
@@ -179,15 +179,17 @@ def current_frame(clip: Clip, options: "cli.Forecast") -> int:
     return index
 
 
-def _street(seed: int, options: "cli.Forecast") -> Clip:
-    from vestcl.data.street import Street
-
+def _street(seed: int, driven: street_input.Driven, options: "cli.Forecast") -> Clip:
+    if driven.depth or driven.masks:
+        raise ValueError(f"{options.input}: must have no depth and masks here; `vestcl prepare` takes them")
     current = STREET_CONTEXT - 1 if options.frame is None else options.frame
     frames = current + 1 + (options.steps if options.compare else 0)
     if frames > MOST_STREET_FRAMES:
         raise ValueError(f"`frame` must be below {MOST_STREET_FRAMES:,} in a street, got {current}")
     height, width = (given or usual for given, usual in zip((options.height, options.width), STREET_SIZE, strict=True))
-    return Street.generate(seed).clip(max(frames, 1), height, width)
+    made, start = street_input.street(seed, driven)
+    fps = driven.drawn(seed).fps or street_input.USUAL_RATE
+    return made.clip(max(frames, 1), height, width, start=start, fps=float(fps))
 
 
 def _resized(clip: Clip, height: int | None, width: int | None) -> Clip:

@@ -7,6 +7,7 @@ from vestcl.data.kitti_raw import ACCUMULATED, VelodyneScan
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.sources import DepthFile, DepthSource, DisparityFile
 from vestcl.data.street_clip import StreetDepth
+from vestcl.data.street_sensors import DisturbedLabels, StreetScan
 from vestcl.scene.inpaint import DEFAULT
 
 #: Depth that is matched where a frame has no other, and a right camera.
@@ -19,6 +20,7 @@ _ACCUMULATED: Final = "KITTI's depth maps, accumulated from scans of frames arou
 _OWN: Final[tuple[tuple[type, str], ...]] = (
     (VelodyneScan, "laser scans, densified"),
     (StreetDepth, "the street itself, true"),
+    (StreetScan, "laser scans simulated from the street's depth, densified"),
     (DisparityFile, "disparity files, matched in the stereo pair"),
 )
 
@@ -64,7 +66,9 @@ def inputs_of(
         inpaint: the method of inpainting, as it was asked for; None is the default.
     """
     labelled = all(sample.labels is not None for sample in clip)
-    classes = "labels" if mask_model is None else f"the classes of {mask_model}"
+    disturbed = any(isinstance(sample.labels, DisturbedLabels) for sample in clip)
+    own_labels = "labels, with a classifier's errors simulated" if disturbed else "labels"
+    classes = own_labels if mask_model is None else f"the classes of {mask_model}"
     depth = f"the estimator {depth_model}" if depth_model is not None else _depth(clip)
     own = any(sample.depth is not None for sample in clip)
     motion = "optical flow" + (" and depth" if own or is_stereo(clip) else "")

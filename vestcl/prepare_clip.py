@@ -70,6 +70,7 @@ def prepare_clip(
     folder: Path,
     inputs: Inputs | None = None,
     *,
+    perceived: Clip | None = None,
     estimators: str = "",
     inpaint: Inpainter | None = None,
     wait: bool = True,
@@ -85,6 +86,8 @@ def prepare_clip(
         clip: at the size wanted, two frames or more.
         folder: for this clip alone.
         inputs: where depth, masks, camera motion and inpainting come from, for clip.json; None reads it off the clip.
+        perceived: the same frames as perception sees them; None is ``clip``. Without right cameras depth is not
+            matched against the right images, which ``clip`` has as targets.
         estimators: a key of the networks that estimate depth or classes for the clip, or inpaint.
         inpaint: how the background is filled, see `vestcl.geometric.Perception`.
         wait: for another process that is at this clip.
@@ -102,16 +105,21 @@ def prepare_clip(
     with _locked(folder, wait) as ours:
         if not ours:
             return None
-        outcome, keys = _complete(EightBitPerception(clip, inpaint=inpaint), folder, estimators, report)
+        perception = EightBitPerception(clip if perceived is None else perceived, inpaint=inpaint)
+        outcome, keys = _complete(clip, perception, folder, estimators, report)
         with _explained(folder / JSON):
             write_clip(folder, clip, keys, inputs)
         return outcome
 
 
-def _complete(perception: Perception, folder: Path, estimators: str, report: Report) -> tuple[Outcome, list[str]]:
+def _complete(
+    clip: Clip, perception: Perception, folder: Path, estimators: str, report: Report
+) -> tuple[Outcome, list[str]]:
     """Write what is missing; returns what was done, and the frames' keys."""
-    clip, start = perception.clip, time.perf_counter()
-    keys = frame_keys(clip, estimators)
+    start = time.perf_counter()
+    if perception.clip is not clip:  # the right images are in no frame's key otherwise
+        estimators += f"|targets {_digest_of(clip).hex()}"
+    keys = frame_keys(perception.clip, estimators)
     missing = {index for index, key in enumerate(keys) if not _is_there(clip, folder, index, key)}
     seconds = Counter({"check": time.perf_counter() - start})
     if missing or not (folder / JSON).is_file():
@@ -122,14 +130,14 @@ def _complete(perception: Perception, folder: Path, estimators: str, report: Rep
     _tidy(folder, len(clip))
     for index, key in enumerate(keys):
         if index in missing:
-            seconds.update(_write(perception, folder, index, key))
+            seconds.update(_write(clip, perception, folder, index, key))
         report(index in missing)
     return Outcome(len(missing), len(clip) - len(missing), {**perception.seconds, **seconds}), keys
 
 
-def _write(perception: Perception, folder: Path, index: int, key: str) -> dict[str, float]:
+def _write(clip: Clip, perception: Perception, folder: Path, index: int, key: str) -> dict[str, float]:
     """Compute and write a frame; returns the seconds that this took beside perception."""
-    frame, camera = prepare_frame(perception, index), perception.clip[index].right
+    frame, camera = prepare_frame(perception, index), clip[index].right
     start = time.perf_counter()
     right = None if camera is None else camera.read_image()
     middle = time.perf_counter()
@@ -226,6 +234,10 @@ def frame_keys(clip: Clip, estimators: str = "") -> list[str]:
             key.update(digest)
         keys.append(key.hexdigest())
     return keys
+
+
+def _digest_of(clip: Clip) -> bytes:
+    return hashlib.sha256(b"".join(map(_sample_digest, clip))).digest()
 
 
 def _sample_digest(sample: Sample) -> bytes:

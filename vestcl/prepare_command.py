@@ -8,16 +8,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
 from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from vestcl import interrupt
+from vestcl.data import street_input
 from vestcl.data.sample import Clip
-from vestcl.data.street import Street
-from vestcl.data.street_drive import Sway
 from vestcl.forecast_checks import check_file_options, is_network_file
 from vestcl.forecast_command import open_clip
 from vestcl.inputs import inputs_of
@@ -29,23 +27,11 @@ from vestcl.scene.inpainters import LAMA, inpainter
 if TYPE_CHECKING:
     from vestcl import cli
 
-#: Inputs that are no files: procedural streets by their seeds.
-STREETS: Final = re.compile(r"street:(\d{1,18})(?:-(\d{1,18}))?")
-
-#: Streets of one input: more are a slip of the finger, and listing them would not end.
-MOST_STREETS: Final = 100_000
-
 #: Where a data set's cache is without ``out``: in it, or for a file beside it.
 BESIDE: Final = ".vestcl"
 
 #: How a network's depth is used, in a cache's key: combined with motion's.
 COMBINED: Final = "combined"
-
-#: With random driving, a street's clip starts somewhere in its first minute, so that all phases of its sway come up.
-STARTS: Final = (0.0, 60.0)
-
-#: Of the random numbers of a street: the driving, and the start.
-_DRIVE, _START = 1, 2
 
 #: Options of a clip's reader, as `vestcl forecast` has them, with what they are if not given.
 _READER: Final[Mapping[str, Any]] = {
@@ -148,22 +134,24 @@ def open_input(text: str, options: "cli.Prepare") -> Clip:
         ValueError: as `vestcl.forecast_command.open_clip`.
     """
     reader = {name: getattr(options, name) for name in _READER}
-    street = STREETS.fullmatch(text)
-    if street is None:
+    street = street_input.parse(text)
+    if street is None or street.seeds is None:
         from vestcl import cli
 
         return open_clip(cli.Forecast(text, height=options.height, width=options.width, **reader))
     if wrong := [name for name, unset in _READER.items() if reader[name] != unset]:
         raise ValueError(f"{text}: is a street, which brings depth and labels; it does not take {', '.join(wrong)}")
-    seed, size = int(street[1]), (options.height, options.width)
-    made, start = Street.generate(seed), 0.0
-    if options.drive == "random":
-        made = dataclasses.replace(made, drive=Sway.drawn(np.random.default_rng([seed, _DRIVE])))
-        start = float(np.random.default_rng([seed, _START]).uniform(*STARTS))
-    clip = made.clip(options.frames, *size, start=start, samples=options.samples)
-    if options.street_depth == "true":
-        return clip
-    return dataclasses.replace(clip, samples=tuple(dataclasses.replace(sample, depth=None) for sample in clip))
+    seed, size = street.seeds[0], (options.height, options.width)
+    driven = _driven(street, options)
+    name = street.driven.drawn(seed).named()
+    return street_input.clip(seed, driven, options.frames, size, options.samples, name)
+
+
+def _driven(street: street_input.StreetInput, options: "cli.Prepare") -> street_input.Driven:
+    """What the input says of its street, and where it says nothing the options."""
+    fps = None if options.street_fps is None else street_input.rate(options.street_fps, "`street_fps`")
+    given = street_input.Driven(options.drive, fps, options.street_depth, options.street_masks)
+    return street.driven.over(given)
 
 
 def _check(options: "cli.Prepare") -> None:
@@ -176,21 +164,14 @@ def _check(options: "cli.Prepare") -> None:
 
 def _expanded(text: str) -> list[str]:
     """A street each for street:FIRST-LAST; anything else is one clip."""
-    streets = STREETS.fullmatch(text)
-    if streets is None:
-        return [text]
-    seeds = range(int(streets[1]), int(streets[2] or streets[1]) + 1)
-    if not seeds:
-        raise ValueError(f"`inputs` must have streets from a lower to a higher seed, got {text}")
-    if len(seeds) > MOST_STREETS:
-        raise ValueError(f"`inputs` must have {MOST_STREETS:,} streets or fewer, got {text}")
-    return [f"street:{seed}" for seed in seeds]
+    streets = street_input.parse(text)
+    return [text] if streets is None or streets.seeds is None else streets.each()
 
 
 def _cache(text: str, options: "cli.Prepare") -> Path:
     if options.out is not None:
         return options.out
-    if STREETS.fullmatch(text):
+    if street_input.parse(text) is not None:
         raise ValueError(f"{text}: is no folder to keep a cache in; `--out` must name one")
     path = Path(text)
     return (path if path.is_dir() else path.parent) / BESIDE
@@ -228,11 +209,16 @@ def _files_of(model: Path) -> list[Path]:
 
 def _prepare(task: Task, waits: bool, report: Report, options: "cli.Prepare") -> Outcome | None:
     clip, inpaint = open_input(task.text, options), None
+    street, seen = street_input.parse(task.text), clip
+    if street is not None and street.seeds is not None:
+        seen = street_input.perceived(clip, _driven(street, options).drawn(street.seeds[0]))
     if options.inpaint is not None:
         inpaint = inpainter(options.inpaint, "inpaint")
-    inputs = inputs_of(clip, depth_model=options.depth_model, mask_model=options.mask_model, inpaint=options.inpaint)
+    inputs = inputs_of(seen, depth_model=options.depth_model, mask_model=options.mask_model, inpaint=options.inpaint)
     key = estimators(options)
-    return prepare_clip(clip, task.folder, inputs, estimators=key, inpaint=inpaint, wait=waits, report=report)
+    return prepare_clip(
+        clip, task.folder, inputs, perceived=seen, estimators=key, inpaint=inpaint, wait=waits, report=report
+    )
 
 
 def _print_end(console: Console, told: Told, tasks: Sequence[Task], which: str) -> None:

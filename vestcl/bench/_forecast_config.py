@@ -22,7 +22,7 @@ class ForecastBench:
 
     inputs: tyro.conf.Positional[tuple[str, ...]]
     """Clips, as `vestcl forecast` opens them, or procedural streets: street:SEED, street:FIRST-LAST, or street: for
-    the twenty that are held out."""
+    the twenty that are held out; with ?drive=road or ?drive=road,fps=25 at its end they bend."""
     steps: int = 5
     """Frames to forecast in each window."""
     horizons: tuple[int, ...] = ()

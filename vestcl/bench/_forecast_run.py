@@ -1,7 +1,6 @@
 """Which windows `vestcl bench forecast` measures, and the run over them."""
 
 import dataclasses
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -15,7 +14,7 @@ from vestcl.bench._forecast_config import HELD_OUT, ForecastBench
 from vestcl.bench._forecast_kept import SUFFIX, Kept, Window
 from vestcl.bench._forecast_list import Listed, read_list
 from vestcl.bench._forecast_truth import Facts
-from vestcl.data import Street
+from vestcl.data import street_input
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.forecast import View
@@ -29,8 +28,6 @@ from vestcl.progress import Bar
 from vestcl.scoring import SOURCE, Record, Truth
 from vestcl.scoring.regions import error_shares
 from vestcl.views import parse_views
-
-_STREETS: Final = re.compile(r"street:(?:(\d{1,18})(?:-(\d{1,18}))?)?")
 
 #: Streets of one input: their frames are made in memory.
 MOST_STREETS: Final = 1000
@@ -93,18 +90,18 @@ def clips_of(text: str, config: ForecastBench) -> list[Clip]:
     Raises:
         ValueError: no clip.
     """
-    streets = _STREETS.fullmatch(text)
+    streets = street_input.parse(text)
     if streets is None:
         check_input(text)
         return [open_sequence(text)]
-    first, last = streets[1], streets[2] or streets[1]
-    seeds = HELD_OUT if first is None else range(int(first), int(last) + 1)
+    seeds = HELD_OUT if streets.seeds is None else streets.seeds
     if len(seeds) > MOST_STREETS:
         raise ValueError(f"`inputs` must have {MOST_STREETS:,} streets or fewer, got {text}")
-    if not seeds:
-        raise ValueError(f"`inputs` must have streets from a lower to a higher seed, got {text}")
-    made = (Street.generate(seed) for seed in seeds)
-    return [street.clip(config.street_frames, *config.street_size, samples=config.samples) for street in made]
+    about, size = streets.driven, config.street_size
+    return [
+        street_input.clip(seed, about, config.street_frames, size, config.samples, about.drawn(seed).named())
+        for seed in seeds
+    ]
 
 
 def chosen_windows(clip: Clip, config: ForecastBench, listed: Mapping[str, Listed] | None = None) -> list[int]:

@@ -152,7 +152,7 @@ class RoadDrive:
         )
 
     def at(self, t: ArrayLike) -> Array:
-        """[..., 6] at times ``t`` [...] in seconds, see `vestcl.data.street_drive`; yaw is from the course's heading."""
+        """[..., 6] at times ``t`` [...] in seconds, see `street_drive`; yaw is from the course's heading."""
         t = np.asarray(t, np.float64)
         s, body = self.travelled(t), self._body(t)
         aside, slope, _ = self._wander(s)
