@@ -104,7 +104,7 @@ Solids = NDArray[np.void]
 #: Metres along a bent street's middle line between the points that a scene has of it, how many of them are skipped in
 #: the search for the nearest, and Newton's steps from there: at a radius of 40 m they end within 1 mm.
 COURSE_STEP: Final = 1.0
-_COARSE, _NEWTON = 8, 4
+_COARSE, _NEWTON = 16, 5
 
 #: One point of it, as kernels/raycast_types.h lays it out.
 COURSE: Final = np.dtype(

@@ -19,7 +19,7 @@ from vestcl.data.street_traffic import Mover
 Array = NDArray[np.float64]
 
 #: Metres of the middle line beyond what is built: the ground goes on.
-_BEYOND: Final = 100.0
+_BEYOND: Final = 40.0
 
 
 def world_from_street(course: Course, s: float) -> Array:
