@@ -28,7 +28,7 @@ Matrix = NDArray[np.float64]
 BRIGHTNESS, CONTRAST, SATURATION, GAMMA, HUE = 0.4, 0.4, 0.4, 0.3, 0.05
 
 #: Luma of RGB (ITU-R BT.601).
-_LUMA: Final = np.array([0.299, 0.587, 0.114])
+LUMA: Final = np.array([0.299, 0.587, 0.114])
 
 #: x -> -x.
 _MIRROR: Final = np.diag([-1.0, 1.0, 1.0, 1.0])
@@ -185,7 +185,7 @@ def draw_colour(rng: np.random.Generator, strength: float, grey: float) -> Colou
         raise ValueError(f"`strength` must be 0 ... 1, got {strength}")
     brightness, contrast, saturation, gamma, hue = strength * rng.uniform(-1, 1, 5)
     factor, spread = 1 + BRIGHTNESS * brightness, 1 + CONTRAST * contrast
-    luma = np.outer(np.ones(3), _LUMA)
+    luma = np.outer(np.ones(3), LUMA)
     colourful = luma + (1 + SATURATION * saturation) * (np.eye(3) - luma)
     matrix = factor * spread * colourful @ _hue_turn(2 * np.pi * HUE * hue)
     return Colour(float(np.exp(GAMMA * gamma)), matrix, float(factor * (1 - spread) * grey))
@@ -198,7 +198,7 @@ def colour(window: Window, change: Callable[[NDArray[np.float32]], NDArray[np.fl
 
 def mean_luma(image: NDArray[np.float32]) -> float:
     """The mean of a picture's luma, [3, H, W] -> a level in [0, 1]."""
-    return float(_LUMA @ image.mean(axis=(1, 2), dtype=np.float64))
+    return float(LUMA @ image.mean(axis=(1, 2), dtype=np.float64))
 
 
 def _hue_turn(angle: float) -> Matrix:

@@ -28,11 +28,39 @@ RULES: Final = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 @dataclass(frozen=True, config=RULES)
+class DegradeConfig:
+    """How images are degraded as cameras do it, by random numbers of the run's seed; 0 leaves a kind out.
+
+    Targets have the blur and the grey of the camera and the exposure of frame t, but no noise and no JPEG: see
+    `train.degrade`.
+    """
+
+    share: Share = 0.5
+    """Of windows that are degraded; the others are as they were prepared."""
+    grey: Share = 0.25
+    """Probability that all images of such a window are grey."""
+    exposure: Weight = 0.15
+    """Standard deviation, in stops, of the exposure at t - 1 against that at t."""
+    white_balance: Weight = 0.03
+    """Standard deviation of the logarithm of the gains of red and blue, the same."""
+    blur: Share = 0.5
+    """Longest time that the shutter is open, as a share of the interval. Targets from the right camera, whose depth is
+    not known, make sharp windows."""
+    noise: Share = 0.02
+    """Highest standard deviation of noise at full signal, which falls with the root of the level."""
+    jpeg: Annotated[int, Strict(), Field(ge=1, le=95)] | None = 40
+    """Lowest quality; null compresses nothing."""
+
+
+@dataclass(frozen=True, config=RULES)
 class DataConfig:
     """What is shown, and how it is varied."""
 
     train: tuple[str, ...]
     """Folders that `vestcl prepare` filled; the last part may be a pattern ("streets/seed-*")."""
+    weights: tuple[Weight, ...] | None = None
+    """How often windows are from each of these folders, one weight each, of which the sum is taken to be 1; null shows
+    each window as often."""
     crop: tuple[Count, Count] | None = None
     """(height, width) px of a window drawn at random; null shows whole images."""
     scale: tuple[Scale, Scale] = (1.0, 1.0)
@@ -47,6 +75,8 @@ class DataConfig:
     """Probability that the target is the right camera, of samples that have one."""
     frames: tuple[CountOrNone, Count] | None = None
     """(first, last) index of the frames that windows may touch, both included; null is the whole clip."""
+    degrade: DegradeConfig | None = None
+    """How images are degraded; null leaves them as they were prepared."""
     split: Literal["kitti-prediction", "kitti-views"] | None = None
     """Show only the drives that this split of KITTI raw trains on (`vestcl.data.splits`); null shows all clips."""
     workers: CountOrNone = 0
@@ -55,6 +85,9 @@ class DataConfig:
     def __post_init__(self) -> None:
         if not self.train:
             raise ValueError("`train` must name a folder or more, got none")
+        if self.weights is not None and (len(self.weights) != len(self.train) or not sum(self.weights) > 0):
+            wanted = f"one weight for each of the {len(self.train)} folders of `train`, one above 0"
+            raise ValueError(f"`weights` must have {wanted}, got {list(self.weights)}")
         if not sum(self.horizons) > 0:
             raise ValueError(f"`horizons` must have a weight above 0, got {list(self.horizons)}")
         if self.scale[0] > self.scale[1]:

@@ -11,8 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
-from train import augment
+from train import augment, degrade
 from train.augment import Window
+from train.config import DegradeConfig
 from vestcl.models._layers import joined
 from vestcl.models.prior import MotionPrior
 from vestcl.network_input import NetworkInput, last_motions, network_input
@@ -20,7 +21,7 @@ from vestcl.prepared import PreparedClip
 from vestcl.scene.layers import LayerBatch
 
 #: What random numbers are for, so that no two purposes share a stream: rng([seed, purpose, count]).
-_ORDER, _HORIZON, _VIEW, _AUGMENT = range(4)
+_ORDER, _HORIZON, _VIEW, _AUGMENT, _GROUP, _DEGRADE = range(6)
 
 #: Frames that are looked at before the target: t - 1 and t.
 _INPUTS: Final = 2
@@ -97,6 +98,12 @@ class WindowSet:
     frames: tuple[int, int] | None = None
     """First and last index, inclusive, of the frames that windows may show. What was measured in a frame may rest on
     the one before it."""
+    degrade: DegradeConfig | None = None
+    """How images are degraded, see `train.degrade`; None leaves them as they are."""
+    groups: tuple[int, ...] = ()
+    """The group of each clip, from 0, where groups have weights."""
+    weights: tuple[float, ...] = ()
+    """How often windows are of each group; none shows each window as often."""
 
     def __post_init__(self) -> None:
         if not self.clips:
@@ -109,6 +116,9 @@ class WindowSet:
         if not 0 < self.scale[0] <= self.scale[1] <= 1 or (self.crop is None and self.scale[0] < self.scale[1]):
             raise ValueError(f"`scale` must be 0 < low <= high <= 1, and low = high without crop, got {self.scale}")
         self._check_sizes()
+        for group in self._weighted_windows:
+            if self.weights[group] > 0 and not self._weighted_windows[group]:
+                raise ValueError(f"`weights` must be 0 for a folder without a window, got {list(self.weights)}")
         if not self.windows:
             longest = max(len(clip) for clip in self.clips)
             within = "" if self.frames is None else f" within frames {self.frames[0]} ... {self.frames[1]}"
@@ -126,6 +136,14 @@ class WindowSet:
             chosen = range(max(first, 0) + _INPUTS - 1, last - len(self.horizons) + 1)
             found += [(number, t) for t in chosen if clip.is_whole(t - 1, 1 + len(self.horizons))]
         return found
+
+    @functools.cached_property
+    def _weighted_windows(self) -> dict[int, list[tuple[int, int]]]:
+        """By group, its windows; empty without weights."""
+        return {
+            group: [(number, t) for number, t in self.windows if self.groups[number] == group]
+            for group in range(len(self.weights))
+        }
 
     @property
     def interval(self) -> float | None:
@@ -146,8 +164,9 @@ class WindowSet:
         """The places of a step's batch, over all ranks.
 
         Position p = step batch + i of an endless sequence has the window that epoch p // n's permutation has at
-        p mod n, with n windows: every window once an epoch. k is drawn for the step, the camera and the augmentation
-        for p.
+        p mod n, with n windows: every window once an epoch. With weights p's group is drawn first, and n counts its
+        windows: in an epoch each comes up or not, by the group's weight. k is drawn for the step, the camera and the
+        augmentation for p.
 
         Args:
             seed: of the run, 0 or more.
@@ -237,14 +256,26 @@ class WindowSet:
         return _matrices(window.path_from_cur or [np.eye(4)] * len(self.horizons))
 
     def _draw(self, seed: int, position: int, horizon: int) -> Draw:
-        epoch, place = divmod(position, len(self.windows))
-        clip, index = self.windows[int(_permutation(len(self.windows), seed, epoch)[place])]
+        windows = self.windows
+        if self.weights:
+            shares = np.array(self.weights) / np.sum(self.weights)
+            windows = self._weighted_windows[
+                int(np.random.default_rng([seed, _GROUP, position]).choice(len(shares), p=shares))
+            ]
+        epoch, place = divmod(position, len(windows))
+        clip, index = windows[int(_permutation(len(windows), seed, epoch)[place])]
         right = bool(np.random.default_rng([seed, _VIEW, position]).random() < self.right)
         return Draw(clip, index, horizon, right, (seed, _AUGMENT, position))
 
     def _made(self, draw: Draw) -> tuple[NetworkInput, Window]:
         try:
-            window = self.augmented(self.window(draw), np.random.default_rng(draw.seed))
+            window, rng = self.window(draw), np.random.default_rng([draw.seed[0], _DEGRADE, *draw.seed[2:]])
+            done = None if self.degrade is None else degrade.draw(rng, self.degrade)
+            if done is not None and done.shutter and not draw.right:
+                window = degrade.blur(window, self.clips[draw.clip].frame(draw.frame + draw.horizon), done.shutter)
+            window = self.augmented(window, np.random.default_rng(draw.seed))
+            if done is not None:
+                window = degrade.degrade(window, done, rng)
             return network_input(window.prev, window.cur, last_motions(window.prev, window.cur)), window
         except (OSError, ValueError) as error:
             raise ValueError(f"{self.label(draw)}: {error}") from error
@@ -333,9 +364,9 @@ def _as_it_is(batch: Item) -> Item:
     return batch
 
 
-@functools.lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=16)
 def _permutation(count: int, seed: int, epoch: int) -> NDArray[np.int64]:
-    """The order of an epoch; a batch looks at two of them at most, and the next one at the same."""
+    """The order of an epoch; a batch looks at two of them at most for each group, and the next one at the same."""
     return np.random.default_rng([seed, _ORDER, epoch]).permutation(count)
 
 

@@ -299,15 +299,16 @@ def window_set(data: DataConfig) -> WindowSet:
     Raises:
         ValueError: no prepared clip there, none of the split, or none long enough.
     """
-    clips = [clip for root in data.train for clip in find_prepared(root)]
+    found = [(clip, group) for group, root in enumerate(data.train) for clip in find_prepared(root)]
     if data.split is not None:
         drives = KITTI_TRAINING[data.split]
-        clips = [clip for clip in clips if clip.name in drives]
-        if not clips:
+        found = [(clip, group) for clip, group in found if clip.name in drives]
+        if not found:
             raise ValueError(f"`data.train` must have drives that {data.split} trains on, got none in {data.train}")
+    clips, groups = [clip for clip, _ in found], tuple(group for _, group in found)
     return WindowSet(
         clips, horizons=data.horizons, crop=data.crop, flip=data.flip, colour=data.colour, right=data.right,
-        frames=data.frames, scale=data.scale,
+        frames=data.frames, scale=data.scale, degrade=data.degrade, groups=groups, weights=data.weights or (),
     )  # fmt: skip
 
 
