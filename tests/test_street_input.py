@@ -112,7 +112,7 @@ def test_a_scan_is_sparse_and_true(session: runtime.Session) -> None:
         shares.append(float((scan > 0).mean()))
         there = scan > 0
         assert np.abs(scan[there] - truth[there]).max() < 0.15
-        assert np.abs(scan[there] - truth[there]).std() == pytest.approx(0.02, rel=0.2)
+        assert (scan[there] - truth[there]).std() == pytest.approx(0.02, rel=0.2)
         assert not (truth[there] == SKY_DEPTH).any() and scan[there].max() < 121
         rows = np.flatnonzero(there[0].any(axis=1))
         assert rows.min() > 40  # 2 degrees above the horizon

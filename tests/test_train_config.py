@@ -222,7 +222,7 @@ def test_configurations_are_frozen(small: Path) -> None:
 def test_the_shipped_ones_are_there() -> None:
     sets = {f"{model}_{data}" for model in ("vest-s", "vest-paper") for data in ("street", "kitti", "cityscapes")}
     variants = {f"{name}_{kind}" for name in sets if "paper" in name for kind in ("two-stages", "mirrored")}
-    more = {"vest-paper_kitti-views", "vest-s_kitti-clip", "ablation_street"}
+    more = {"vest-paper_kitti-views", "vest-s_kitti-clip", "vest-s_road", "ablation_street"}
     assert {path.stem for path in CONFIGS} == sets | variants | more
 
 
@@ -246,6 +246,7 @@ def test_what_is_tuned_on_real_streets_has_frames_and_folders_of_its_own() -> No
     frames = {name: config.data.frames for name, config in configs.items()}
     assert frames == {
         "vest-s_street": (1, 9), "vest-s_kitti": None, "vest-s_cityscapes": None, "vest-s_kitti-clip": (0, 35),
+        "vest-s_road": (1, 8),
     }  # fmt: skip
 
 

@@ -160,18 +160,21 @@ def test_batches_are_degraded_alike_again_and_only_if_asked_for(clips: list[Prep
 
 
 def test_folders_are_mixed_by_weight(cache: Path) -> None:
-    data = DataConfig(train=(str(cache / "usual"), str(cache / "road")), weights=(0.25, 0.75))
+    usual, road = str(cache / "usual"), str(cache / "road")
+    data = DataConfig(train=(usual, road), weights=((usual, 0.25), (road, 0.75)))
     windows = window_set(data)
     draws = [draw for step in range(50) for draw in windows.global_batch(1, step, 8)]
     counts = Counter(windows.clips[draw.clip].folder.parent.name for draw in draws)
     assert 0.67 < counts["road"] / len(draws) < 0.83
     assert {draw.frame for draw in draws} == {1, 2, 3}
     assert draws[:8] == windows.global_batch(1, 0, 8)
-    only = window_set(dataclasses.replace(data, weights=(0.0, 1.0)))
+    only = window_set(dataclasses.replace(data, weights=((road, 1.0),)))
     assert {only.clips[draw.clip].folder.parent.name for draw in only.global_batch(1, 0, 20)} == {"road"}
 
 
 def test_weights_that_fit_no_folders_are_refused() -> None:
-    for weights in ((1.0,), (0.0, 0.0), (-1.0, 2.0)):
+    for weight in (0.0, -1.0):
         with pytest.raises(ValueError, match="weights"):
-            DataConfig(train=("a", "b"), weights=weights)
+            DataConfig(train=("a", "b"), weights=(("a", weight),))
+    with pytest.raises(ValueError, match="`data.weights` must name folders of `data.train`, a, b, got c"):
+        window_set(DataConfig(train=("a", "b"), weights=(("c", 1.0),)))

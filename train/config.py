@@ -58,9 +58,9 @@ class DataConfig:
 
     train: tuple[str, ...]
     """Folders that `vestcl prepare` filled; the last part may be a pattern ("streets/seed-*")."""
-    weights: tuple[Weight, ...] | None = None
-    """How often windows are from each of these folders, one weight each, of which the sum is taken to be 1; null shows
-    each window as often."""
+    weights: tuple[tuple[str, Weight], ...] = ()
+    """[folder as in ``train``, weight] each: how often windows are from it. The sum of weights is taken to be 1, and
+    folders that are not listed weigh 0; without any each window is shown as often."""
     crop: tuple[Count, Count] | None = None
     """(height, width) px of a window drawn at random; null shows whole images."""
     scale: tuple[Scale, Scale] = (1.0, 1.0)
@@ -85,9 +85,8 @@ class DataConfig:
     def __post_init__(self) -> None:
         if not self.train:
             raise ValueError("`train` must name a folder or more, got none")
-        if self.weights is not None and (len(self.weights) != len(self.train) or not sum(self.weights) > 0):
-            wanted = f"one weight for each of the {len(self.train)} folders of `train`, one above 0"
-            raise ValueError(f"`weights` must have {wanted}, got {list(self.weights)}")
+        if self.weights and not sum(weight for _, weight in self.weights) > 0:
+            raise ValueError(f"`weights` must have a weight above 0, got {[list(entry) for entry in self.weights]}")
         if not sum(self.horizons) > 0:
             raise ValueError(f"`horizons` must have a weight above 0, got {list(self.horizons)}")
         if self.scale[0] > self.scale[1]:

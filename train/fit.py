@@ -299,6 +299,7 @@ def window_set(data: DataConfig) -> WindowSet:
     Raises:
         ValueError: no prepared clip there, none of the split, or none long enough.
     """
+    weights = _group_weights(data)
     found = [(clip, group) for group, root in enumerate(data.train) for clip in find_prepared(root)]
     if data.split is not None:
         drives = KITTI_TRAINING[data.split]
@@ -308,8 +309,21 @@ def window_set(data: DataConfig) -> WindowSet:
     clips, groups = [clip for clip, _ in found], tuple(group for _, group in found)
     return WindowSet(
         clips, horizons=data.horizons, crop=data.crop, flip=data.flip, colour=data.colour, right=data.right,
-        frames=data.frames, scale=data.scale, degrade=data.degrade, groups=groups, weights=data.weights or (),
+        frames=data.frames, scale=data.scale, degrade=data.degrade, groups=groups, weights=weights,
     )  # fmt: skip
+
+
+def _group_weights(data: DataConfig) -> tuple[float, ...]:
+    """The weight of each folder; none where none is listed.
+
+    Raises:
+        ValueError: a weight of a folder that is not there.
+    """
+    listed = dict(data.weights)
+    if unknown := [name for name in listed if name not in data.train]:
+        wanted = f"folders of `data.train`, {', '.join(data.train)}"
+        raise ValueError(f"`data.weights` must name {wanted}, got {', '.join(unknown)}; data.weights=[] has none")
+    return tuple(listed.get(name, 0.0) for name in data.train) if listed else ()
 
 
 if __name__ == "__main__":
