@@ -130,13 +130,13 @@ static surface_t surface_of(const scene_t* scene, global const solid_t* solid, c
   }
 }
 
-// Linear light from what the ray hits at z-depth s: solid `id`, ROAD or SKY.
-static float3 colour_of(const scene_t* scene, float3 ray, float s, int id)
+// Linear light from what the ray hits at z-depth s: solid `id`, ROAD or SKY. It stands for `pixel` metres at 1 m.
+static float3 colour_of(const scene_t* scene, float3 ray, float s, int id, float pixel)
 {
   global const view_t* view = scene->view;
   const float3 sun = load3(view->sun), unit_ray = normalize(ray);
   if (id == SKY) return cloudy_sky(unit_ray, sun, view->seed);
-  hit_t hit = {s * ray, (float3)(0), (float3)(0, -1, 0), s * view->pixel, 1, FACE_TOP};
+  hit_t hit = {s * ray, (float3)(0), (float3)(0, -1, 0), s * pixel, 1, FACE_TOP};
   global const solid_t* solid = scene->solids + max(id, 0);
   if (id != ROAD) {
     hit.own = to_local(solid, hit.point - load3(solid->centre));
@@ -149,6 +149,43 @@ static float3 colour_of(const scene_t* scene, float3 ray, float s, int id)
   const float2 light = light_at(scene, hit.point + 0.01f * hit.normal, id, ground);
   return haze(shade(surface, hit.normal, unit_ray, sun, light), s);
 }
+
+#ifdef BENT
+// Marks the pixels all of whose rays meet one smooth surface, and shades each once, by the centre's ray: textures are
+// filtered for the width that a ray stands for. Of a plane the mean of 1 / z over rays is that of the centre. Returns
+// whether these are all of the row.
+static bool shade_plain(
+    const scene_t* scene, global const ushort* listed, int count, global const int4* image_rects, int y, int x0,
+    int samples, int lanes, const row_t* centre, int* plain, float3* light)
+{
+  const int rays = samples * samples;
+  row_t row;
+  float inverse[LANES];
+  for (int lane = 0; lane < LANES; lane++) {
+    inverse[lane] = 0;
+    plain[lane] = 1;
+  }
+  for (int pass = 0; pass < rays; pass++) {
+    const float2 inside = (float2)(pass % samples + 0.5f, pass / samples + 0.5f) / samples;
+    const float3 left = multiply(scene->view->ray, (float3)(x0 + inside.x, y + inside.y, 1));
+    trace(scene, listed, count, image_rects, y, left, &row);
+    for (int lane = 0; lane < lanes; lane++) {
+      plain[lane] &= row.hit[lane] == centre->hit[lane];
+      inverse[lane] += 1 / row.best[lane];
+    }
+  }
+  bool all_plain = true;
+  for (int lane = 0; lane < lanes; lane++) {
+    plain[lane] &= fabs(inverse[lane] * centre->best[lane] / rays - 1) < SMOOTH;
+    all_plain = all_plain && plain[lane];
+    if (!plain[lane]) continue;
+    const float3 ray = (float3)(centre->x[lane], centre->y[lane], centre->z[lane]);
+    const float pixel = samples * scene->view->pixel;
+    light[lane] = rays * colour_of(scene, ray, centre->best[lane], centre->hit[lane], pixel);
+  }
+  return all_plain;
+}
+#endif
 
 // Depth, label and instance are of the ray through a pixel's centre. Colour is the mean over samples x samples rays a
 // pixel in linear light, as a sensor sums it, and only then goes through the film curve: display() of a mean.
@@ -190,7 +227,11 @@ kernel void raycast(
   const size_t plane = (size_t)height * width, at = (size_t)y * width + x0;
   row_t row;
   float3 light[LANES];
-  for (int lane = 0; lane < LANES; lane++) light[lane] = 0;
+  int plain[LANES];  // whether a pixel's colour is known without its own rays
+  for (int lane = 0; lane < LANES; lane++) {
+    light[lane] = 0;
+    plain[lane] = 0;
+  }
   for (int pass = samples > 1 ? -1 : 0; pass < max(rays, 1); pass++) {  // of several rays, first the centre's
     const bool centre = samples < 2 || pass < 0;
     const float2 inside = centre ? (float2)(0.5f) : (float2)(pass % samples + 0.5f, pass / samples + 0.5f) / samples;
@@ -202,8 +243,16 @@ kernel void raycast(
       labels[at + lane] = id == SKY ? LABEL_SKY : id == ROAD ? LABEL_ROAD : solids[id].label;
       if (with_instances) instances[at + lane] = id < 0 ? 0 : solids[id].instance;
     }
-    for (int lane = 0; lane < lanes && pass >= 0 && rays > 0; lane++)
-      light[lane] += colour_of(&scene, (float3)(row.x[lane], row.y[lane], row.z[lane]), row.best[lane], row.hit[lane]);
+    for (int lane = 0; lane < lanes && pass >= 0 && rays > 0; lane++) {
+      if (plain[lane]) continue;
+      const float3 ray = (float3)(row.x[lane], row.y[lane], row.z[lane]);
+      light[lane] += colour_of(&scene, ray, row.best[lane], row.hit[lane], view->pixel);
+    }
+#ifdef BENT
+    if (pass < 0 &&
+        shade_plain(&scene, listed, tile_counts[tile], image_rects, y, x0, samples, lanes, &row, plain, light))
+      break;
+#endif
   }
   for (int lane = 0; lane < lanes && rays > 0; lane++) {
     const float3 c = display(light[lane] / rays);

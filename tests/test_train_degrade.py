@@ -176,5 +176,5 @@ def test_weights_that_fit_no_folders_are_refused() -> None:
     for weight in (0.0, -1.0):
         with pytest.raises(ValueError, match="weights"):
             DataConfig(train=("a", "b"), weights=(("a", weight),))
-    with pytest.raises(ValueError, match="`data.weights` must name folders of `data.train`, a, b, got c"):
+    with pytest.raises(ValueError, match=r"`data\.weights` must name folders of `data\.train`, a, b, got c"):
         window_set(DataConfig(train=("a", "b"), weights=(("c", 1.0),)))

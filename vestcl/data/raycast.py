@@ -106,6 +106,9 @@ Solids = NDArray[np.void]
 COURSE_STEP: Final = 1.0
 _COARSE, _NEWTON = 16, 5
 
+#: On a bent street a pixel's rays are shaded as one where the mean of their 1 / z differs from the centre's by less.
+_SMOOTH: Final = "1e-3f"
+
 #: One point of it, as kernels/raycast_types.h lays it out.
 COURSE: Final = np.dtype(
     [("place", np.float32, 2), ("ahead", np.float32, 2), ("curvature", np.float32), ("along", np.float32)]
@@ -224,7 +227,13 @@ def _launch(
         np.dtype(np.float32), SKY_DEPTH=f"{SKY_DEPTH}f", SHADOW_CELL=f"{SHADOW_CELL}f", **names
     )
     if bent:
-        defines |= {"BENT": 1, "COURSE_STEP": f"{COURSE_STEP}f", "COARSE": _COARSE, "NEWTON": _NEWTON}
+        defines |= {
+            "BENT": 1,
+            "COURSE_STEP": f"{COURSE_STEP}f",
+            "COARSE": _COARSE,
+            "NEWTON": _NEWTON,
+            "SMOOTH": _SMOOTH,
+        }
     job.launch("raycast.cl", name, defines, global_size, arguments, local_size)
 
 
