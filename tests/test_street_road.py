@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from vestcl import runtime
-from vestcl.data import Label, Street, intrinsics, street_road
+from vestcl.data import Label, Street, intrinsics, street_profile, street_road
 from vestcl.data.layout import BLOCK, Layout, anchored_block, block
 from vestcl.data.raycast import Material
 from vestcl.data.street_bent import world_from_street
@@ -100,8 +100,7 @@ def smooth(**changes: Any) -> RoadDrive:
 
 
 def test_braking_dives_and_bends_lean_outward(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(street_road, "BUMP_HEIGHT", 0.0)
-    monkeypatch.setattr(street_road, "WANDER", ())
+    monkeypatch.setattr(street_profile, "BUMP_HEIGHT", 0.0)
     monkeypatch.setattr(street_road.RoadDrive, "_wander", lambda self, s: (0 * s, 0 * s, 0 * s))
     drive = smooth(seed=990011)
     t = np.arange(0, 60, 0.05)
@@ -117,6 +116,18 @@ def test_the_body_moves_as_much_as_on_real_roads() -> None:
     """KITTI odometry 00 and 06: pitch 0.15 and 0.31 degrees, roll 0.13 and 0.29; see `street_drive`."""
     spreads = np.array([RoadDrive.drawn(seed).at(np.arange(0, 40, 0.1))[:, 4:].std(axis=0) for seed in range(8)])
     assert np.all((np.degrees(np.median(spreads, axis=0)) > 0.1) & (np.degrees(np.median(spreads, axis=0)) < 0.4))
+
+
+def test_the_profile_has_the_roughness_of_the_standard(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ISO 8608: the variance of a band of spatial frequencies is the integral of Gd(n0) (n / n0)^-2."""
+    monkeypatch.setattr(street_profile, "BUMP_HEIGHT", 0.0)
+    step, count = 0.1, 1 << 16
+    height, _ = street_profile.profile(4, 16e-6, step * np.arange(count))
+    power = 2 * np.abs(np.fft.rfft(height * np.hanning(count))) ** 2 * step / (0.375 * count)
+    n = np.fft.rfftfreq(count, step)
+    for low, high in ((0.03, 0.3), (0.3, 2.5)):
+        band = (n > low) & (n < high)
+        assert power[band].sum() * n[1] == pytest.approx(16e-6 * 0.01 * (1 / low - 1 / high), rel=0.25)
 
 
 # ---------------------------------------------------------------- what stands and moves along it

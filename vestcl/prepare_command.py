@@ -229,5 +229,8 @@ def _print_end(console: Console, told: Told, tasks: Sequence[Task], which: str) 
     console.print(table)
     about = f"{len(tasks)} clip{'s' * (len(tasks) != 1)}{which}: {told.computed} frames computed, {told.kept} kept"
     console.print(about, highlight=False)
+    if told.computed:
+        each, frames = sum(told.seconds.values()) / told.computed, sum(task.frames for task in tasks) / len(tasks)
+        console.print(f"{each:.2f} s per computed frame, {each * frames:.1f} s per clip of {frames:g}", highlight=False)
     for folder in dict.fromkeys(str(task.folder.parent) for task in tasks):
         console.print(folder, highlight=False, markup=False, soft_wrap=True)

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import signal  # type: ignore[import-untyped]
 
 from vestcl.data.street_course import GRAVITY, Course
+from vestcl.data.street_profile import ROUGHNESS, TRACK, profile
 
 Array = NDArray[np.float64]
 
@@ -50,25 +51,6 @@ DWELLS: Final = (1.0, 6.0)
 SLOW_LENGTHS: Final = (5.0, 50.0)
 SLOW_SHARES: Final = (0.3, 0.8)
 
-#: Roughness Gd(n0) at n0 = 0.1 cycles/m, m^3: ISO 8608:2016 has 16e-6 for the middle of class A, 64e-6 for class B,
-#: 256e-6 for C; Gd(n) = Gd(n0) (n / n0)^-2. Paved roads in towns are of A and B.
-ROUGHNESS: Final = (4e-6, 64e-6)
-N0: Final = 0.1
-
-#: Spatial frequencies of the profile, cycles/m, and how many: waves from 100 m to 0.33 m.
-WAVES: Final = (0.01, 3.0)
-WAVE_COUNT: Final = 64
-
-#: Decay of the coherence of left and right track with spatial frequency, exp(-r n b) for a track b (Bogsjo 2007,
-#: Coherence of road roughness in left and right wheel-path, Vehicle System Dynamics 46: 1 to 6).
-COHERENCE: Final = 3.0
-
-#: Single bumps and dips, patches, covers and joints: metres between them, their length and height in metres. Chosen,
-#: below the 75 mm of a speed hump (ITE 2011).
-BUMP_SPACING: Final = 70.0
-BUMP_LENGTHS: Final = (0.6, 4.0)
-BUMP_HEIGHT: Final = 0.02
-
 #: Undamped frequencies of passenger cars' bodies in Hz, damping ratio, degrees of pitch and roll per g of acceleration:
 #: Gillespie 1992, Fundamentals of Vehicle Dynamics, chapters 5 and 6 (ride 1 to 1.5 Hz, damping 0.2 to 0.4); roll 3
 #: to 7 and pitch 1 to 3 degrees per g (Milliken and Milliken 1995, Race Car Vehicle Dynamics, chapter 16).
@@ -77,8 +59,8 @@ DAMPING: Final = (0.2, 0.4)
 PITCH_DEGREES: Final = (1.0, 3.0)
 ROLL_DEGREES: Final = (3.0, 7.0)
 
-#: Wheelbase and track, metres, of a compact car.
-WHEELBASE, TRACK = 2.65, 1.55
+#: Wheelbase, metres, of a compact car.
+WHEELBASE: Final = 2.65
 
 #: (wavelength in m, amplitude in m) of the wander in the lane: a standard deviation of 0.15 m; 0.15 to 0.25 m in tests
 #: on roads (O'Hanlon et al. 1982, Diazepam impairs lateral position control in highway driving, Science 217).
@@ -100,7 +82,7 @@ GRID: Final = 2.0
 PREVIEW: Final = 300.0
 
 #: Of the random numbers of a drive.
-_EVENTS, _PROFILE, _BUMPS, _WANDER, _DRAWN = range(50, 55)
+_EVENTS, _WANDER, _DRAWN = 50, 53, 54
 
 
 @dataclass(frozen=True)
@@ -214,29 +196,6 @@ class RoadDrive:
             result[here] = a + x * x * (3 - 2 * x) * (b - a) + x * (1 - x) * ((1 - x) * slope_a - x * slope_b)
         return result
 
-    def _profile(self, s: Array) -> tuple[Array, Array]:
-        """The road's height below both wheels of an axle, and left less right, metres, at s [...]."""
-        edges = np.geomspace(*WAVES, WAVE_COUNT + 1)
-        n = np.sqrt(edges[1:] * edges[:-1])
-        rng = np.random.default_rng([self.seed, _PROFILE])
-        size = np.sqrt(2 * self.roughness * (n / N0) ** -2 * np.diff(edges))
-        apart = size * np.sqrt(2 * (1 - np.exp(-COHERENCE * n * TRACK)))
-        phase, other = rng.uniform(0, 2 * np.pi, (2, WAVE_COUNT))
-        angle = 2 * np.pi * s[..., None] * n
-        return np.sin(angle + phase) @ size + self._bumps(s), np.sin(angle + other) @ apart
-
-    def _bumps(self, s: Array) -> Array:
-        """Raised cosines, one somewhere in each BUMP_SPACING metres."""
-        height = np.zeros_like(s)
-        slots = np.floor(s / BUMP_SPACING).astype(np.intp)
-        for slot in np.unique(slots):
-            rng = np.random.default_rng([self.seed, _BUMPS, 2 * abs(int(slot)) + (slot < 0)])
-            length = rng.uniform(*BUMP_LENGTHS)
-            middle = (slot + rng.uniform(0.1, 0.9)) * BUMP_SPACING
-            place = np.clip((s - middle) / length, -0.5, 0.5)
-            height += BUMP_HEIGHT * rng.uniform(-1, 1) * (0.5 + 0.5 * np.cos(2 * np.pi * place))
-        return height
-
 
 # ---------------------------------------------------------------- the driver
 
@@ -336,8 +295,8 @@ def _body_stretch(drive: RoadDrive, number: int) -> Array:
     start = number * BODY_STRETCH
     ticks = np.arange(-round(SETTLING / BODY_TICK) - 1, round(BODY_STRETCH / BODY_TICK) + 3)
     s, v, a = drive.state(start + ticks * BODY_TICK).T
-    front, apart = drive._profile(s + WHEELBASE / 2)
-    rear, apart_behind = drive._profile(s - WHEELBASE / 2)
+    front, apart = profile(drive.seed, drive.roughness, s + WHEELBASE / 2)
+    rear, apart_behind = profile(drive.seed, drive.roughness, s - WHEELBASE / 2)
     bend = drive.course.curvature(s) + drive._wander(s)[2]
     inertia = np.stack([drive.pitch_gain * a, -drive.roll_gain * v**2 * bend, np.zeros_like(a)])
     road = np.stack([(front - rear) / WHEELBASE, (apart + apart_behind) / 2 / TRACK, (front + rear) / 2])
