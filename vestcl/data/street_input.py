@@ -89,7 +89,13 @@ class StreetInput:
     text: str
 
     def each(self) -> list[str]:
-        """An input for each seed."""
+        """An input for each seed.
+
+        Raises:
+            ValueError: more than `MOST_STREETS`.
+        """
+        if len(self.seeds or ()) > MOST_STREETS:
+            raise ValueError(f"`inputs` must have {MOST_STREETS:,} streets or fewer, got {self.text}")
         _, mark, options = self.text.partition("?")
         return [f"street:{seed}{mark}{options}" for seed in self.seeds or ()]
 
@@ -101,7 +107,7 @@ def parse(text: str) -> StreetInput | None:
         None for any other text.
 
     Raises:
-        ValueError: seeds in the wrong order or too many, an option that a street does not have.
+        ValueError: seeds in the wrong order, an option that a street does not have.
     """
     found = _PATTERN.fullmatch(text)
     if found is None:
@@ -110,8 +116,6 @@ def parse(text: str) -> StreetInput | None:
     seeds = None if first is None else range(int(first), int(last) + 1)
     if seeds is not None and not seeds:
         raise ValueError(f"`inputs` must have streets from a lower to a higher seed, got {text}")
-    if seeds is not None and len(seeds) > MOST_STREETS:
-        raise ValueError(f"`inputs` must have {MOST_STREETS:,} streets or fewer, got {text}")
     return StreetInput(seeds, USUAL if options is None else _options(text, options), text)
 
 
