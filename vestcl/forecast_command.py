@@ -188,8 +188,10 @@ def _street(seed: int, driven: street_input.Driven, options: "cli.Forecast") -> 
         raise ValueError(f"`frame` must be below {MOST_STREET_FRAMES:,} in a street, got {current}")
     height, width = (given or usual for given, usual in zip((options.height, options.width), STREET_SIZE, strict=True))
     made, start = street_input.street(seed, driven)
-    differing = {"start": start, "fps": float(driven.drawn(seed).fps or street_input.USUAL_RATE)}
-    return made.clip(max(frames, 1), height, width, **(differing if driven != street_input.USUAL else {}))
+    if driven == street_input.USUAL:
+        return made.clip(max(frames, 1), height, width)
+    fps = float(driven.drawn(seed).fps or street_input.USUAL_RATE)
+    return made.clip(max(frames, 1), height, width, start=start, fps=fps)
 
 
 def _resized(clip: Clip, height: int | None, width: int | None) -> Clip:
