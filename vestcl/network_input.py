@@ -2,19 +2,35 @@
 it."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from vestcl import geometry
-from vestcl.models.ego_motion import RigidMotion
+from vestcl.models.camera_correction import INTERVAL, MEASURED, rates_of
 from vestcl.models.prior import MotionPrior
+from vestcl.models.rigid_motion import RigidMotion
 from vestcl.prepared import Prepared
 from vestcl.scene import _check
 from vestcl.scene.ego_motion import constant_velocity
 from vestcl.scene.layers import LayerBatch, batch
+from vestcl.scene.motion.camera_forecast import forecast_camera
+
+#: So many last motions count in a path, as in the geometric forecast.
+PAST: Final = MEASURED
+
+
+class CameraPath(NamedTuple):
+    """A camera's motion, forecast from those that were measured; `camera_path` makes one."""
+
+    future_from_cur: tuple[NDArray[np.float64], ...]
+    """[4, 4] m each, after 1, 2 ... intervals."""
+    measured: NDArray[np.float32]
+    """[MEASURED, RATES], see `vestcl.models.camera_correction.rates_of`."""
+    seconds: float
+    """An interval."""
 
 
 class NetworkInput(NamedTuple):
@@ -32,13 +48,16 @@ class NetworkInput(NamedTuple):
     """[1, 1, H, W], 1 where the recording car itself is in either image; None is nowhere."""
 
 
-def network_input(prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.float64]]) -> NetworkInput:
-    """Two prepared frames with their motion prior: constant velocity, of the camera and of all that moves beside it.
+def network_input(
+    prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.float64]], path: CameraPath | None = None
+) -> NetworkInput:
+    """Two prepared frames with their motion prior: the camera's motion, and constant velocity of all dynamic objects.
 
-    next_from_cur = constant_velocity(motions) over one interval of the clip, and the last two motions as they are. What
-    moves, moves by its own velocity v in the axes of its frame: the networks take it to R (x + n v) + t after n
-    intervals. The recording car's own bonnet does not move in the picture, so there x = R (x + n v) + t, which gives
-    v = (R^-1 (x - t) - x) / n: n = 1 interval from t, and ``cur.elapsed`` more from t - 1.
+    next_from_cur = constant_velocity(motions) over one interval of the clip, or what ``path`` has for it and for later
+    ones; and the last two motions as they are. What moves, moves by its own velocity v in the axes of its frame: the
+    networks take it to R (x + n v) + t after n intervals. The recording car's own bonnet does not move in the image, so
+    there x = R (x + n v) + t, which gives v = (R^-1 (x - t) - x) / n: n = 1 interval from t, and ``cur.elapsed`` more
+    from t - 1.
 
     Args:
         prev: the frame at t - 1.
@@ -46,6 +65,7 @@ def network_input(prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.fl
         motions: ``cur_from_prev`` [4, 4] m of the last consecutive frames, oldest first; the last one is from ``prev``
             to ``cur``, over ``cur.elapsed`` intervals, the one before over ``prev.elapsed``, others over one. One or
             two are usual, see `last_motions`.
+        path: the camera's forecast motion, from `camera_path`; None is constant velocity.
 
     Returns:
         The input with B = 1; tensors of their own memory.
@@ -63,7 +83,7 @@ def network_input(prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.fl
     motions = [_check.matrix("motions", motion, 4) for motion in motions]
     elapsed = [1.0] * len(motions)
     elapsed[-2:] = [prev.elapsed, cur.elapsed][-len(motions) :]
-    next_from_cur = constant_velocity(motions, elapsed)
+    next_from_cur = constant_velocity(motions, elapsed) if path is None else path.future_from_cur[0]
     next_from_prev = next_from_cur @ motions[-1]
     prior = MotionPrior(
         as_motion(next_from_cur),
@@ -73,9 +93,44 @@ def network_input(prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.fl
         torch.from_numpy(_velocity(cur, next_from_cur, 1)[None]),
         torch.tensor([1 + cur.elapsed]),
         torch.tensor([True]),
+        *(() if path is None else (_later(path), torch.from_numpy(path.measured[None]), torch.tensor([path.seconds]))),
     )
     own = torch.from_numpy((prev.own | cur.own)[None]).float()
     return NetworkInput(batch([prev.layers]), batch([cur.layers]), torch.from_numpy(cur.K[None]).float(), prior, own)
+
+
+def camera_path(
+    motions: Sequence[NDArray[np.float64]],
+    elapsed: Sequence[float],
+    seconds: float | None,
+    steps: int,
+    by_flow: bool = False,
+) -> CameraPath:
+    """Where a camera will be by `vestcl.scene.motion.camera_forecast`, and the motions that say so.
+
+    Args:
+        motions: ``cur_from_prev`` [4, 4] m of the last consecutive frames, oldest first, one or more; `PAST` count. Of
+            a single one the path is that motion at constant velocity.
+        elapsed: intervals that each took.
+        seconds: an interval of the clip; None, where it is not known, is `INTERVAL`.
+        steps: intervals to forecast, 1 or more.
+        by_flow: whether motions are measured from flow only, without depth.
+
+    Raises:
+        ValueError: as `vestcl.scene.motion.camera_forecast.forecast_camera`.
+    """
+    dt = seconds or INTERVAL
+    motions, times = motions[-PAST:], [dt * each for each in elapsed[-PAST:]]
+    cameras = forecast_camera(motions, times, [dt * step for step in range(1, steps + 1)], by_flow)
+    measured = rates_of([as_motion(np.asarray(motion, np.float64)) for motion in motions], torch.tensor([times]))
+    return CameraPath(tuple(cameras), measured[0].numpy(), dt)
+
+
+def _later(path: CameraPath) -> RigidMotion | None:
+    """The motions of the intervals after the first, [1, n, 4] and [1, n, 3]."""
+    pairs = zip(path.future_from_cur[1:], path.future_from_cur, strict=False)
+    each = [as_motion(np.asarray(later @ np.linalg.inv(before), np.float64)) for later, before in pairs]
+    return RigidMotion(*(torch.stack(parts, dim=1) for parts in zip(*each, strict=True))) if each else None
 
 
 def last_motions(*frames: Prepared) -> list[NDArray[np.float64]]:

@@ -70,7 +70,7 @@ class Step(NamedTuple):
 def next_prior(prior: MotionPrior, motion: Motion, seen: RenderedView, K: torch.Tensor) -> MotionPrior:
     """Of the step after ``motion``, from which the source camera has ``seen`` the result."""
     moved = (motion.objects.flow - motion.flow0)[:, 3:]
-    return repeated(prior, motion.next_from_cur, moved, seen, K)
+    return repeated(prior, motion.next_from_cur, moved, seen, K, motion.later)
 
 
 def flattened(points: Sequence[torch.Tensor], flow: torch.Tensor) -> torch.Tensor:

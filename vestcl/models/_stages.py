@@ -149,13 +149,15 @@ class Stages(nn.Module):
                 tokens of it are masked, as foreground is; None is nowhere.
         """
         if prior is not None and not prior.is_corrected:
-            return CameraMotion(prior.next_from_cur.after(prior.cur_from_prev), prior.next_from_cur)
+            known = prior.camera
+            later = tuple(known.interval(k) for k in range(1, known.intervals))
+            return CameraMotion(prior.next_from_cur.after(prior.cur_from_prev), prior.next_from_cur, later)
         if self.ego_motion is None or prev.camera_grid is None or cur.camera_grid is None:
             return CameraMotion(*2 * (RigidMotion.rest(cur.features),))
         masks = [frame.layers.mask if own is None else frame.layers.mask * (1 - own) for frame in (prev, cur)]
         mask_prev, mask_cur = map(grid_mean, masks)
-        known = None if prior is None else (prior.next_from_cur, prior.cur_from_prev, prior.prev_from_before)
-        return self.ego_motion.decide(prev.camera_grid, cur.camera_grid, mask_prev, mask_cur, known)
+        start = None if prior is None else prior.camera
+        return self.ego_motion.decide(prev.camera_grid, cur.camera_grid, mask_prev, mask_cur, start)
 
     @timed
     def move_objects(

@@ -27,6 +27,7 @@ from types import MappingProxyType
 from typing import Final, Literal, get_args
 
 from vestcl import constants
+from vestcl.times import is_same
 
 Mode = Literal["feedback", "compose"]
 """How frames after the first are forecast; see `vestcl.models.forecaster.Forecaster.forecast`."""
@@ -88,8 +89,13 @@ class EgoMotionConfig:
     """Hidden units of a block's MLP over channels of a token."""
     path: int = 1
     """Frame intervals ahead that the camera's motion is forecast for in one go; more than one needs a prior."""
+    correction: Literal["linear", "bounded"] = "linear"
+    """How a prior is corrected: "linear" in the last two motions, at one frame rate; or "bounded" by what a car can do
+    within the time between frames, which is an input, and gated (`vestcl.models.camera_correction`)."""
 
     def __post_init__(self) -> None:
+        if self.correction not in ("linear", "bounded"):
+            raise ValueError(f'`correction` must be "linear" or "bounded", got {self.correction!r}')
         if (channels := 2 * self.widths[-1]) % (4 * self.heads):
             raise ValueError(f"2 `widths[-1]` must be a multiple of 4 `heads` = {4 * self.heads}, got {channels}")
         if self.path < 1:
@@ -207,11 +213,20 @@ class ModelConfig:
     is 0. None uses the depth that comes in."""
     start: Literal["rest", "prior"] = "rest"
     """What motion networks correct: no motion, or one that was measured and extrapolated (`MotionPrior`)."""
+    prior: Literal["velocity", "forecast"] = "velocity"
+    """The camera's motion that a prior starts from: at constant velocity, or `vestcl.scene.motion.camera_forecast`."""
     interval_s: float = 0.1
     """Seconds from frame to frame that motion networks learned at; a prior over another interval is not corrected."""
+    intervals_s: tuple[float, float] | None = None
+    """The shortest and the longest of them, where a network learned at several; None is `interval_s`."""
     mode: Mode | None = None
     """How frames after the first are forecast unless a call says otherwise; None follows `start`: "feedback" from rest,
     as the paper does, "compose" from a prior. `default_mode` has the answer."""
+
+    def knows(self, seconds: float) -> bool:
+        """Whether motion networks learned at frames that are ``seconds`` apart, up to a fifth."""
+        shortest, longest = self.intervals_s or (self.interval_s, self.interval_s)
+        return shortest <= seconds <= longest or is_same(seconds, shortest) or is_same(seconds, longest)
 
     @property
     def default_mode(self) -> Mode:
@@ -223,10 +238,14 @@ class ModelConfig:
             raise ValueError(f'`mode` must be "feedback", "compose" or None, got {self.mode!r}')
         if self.start not in ("rest", "prior"):
             raise ValueError(f'`start` must be "rest" or "prior", got {self.start!r}')
+        if self.prior not in ("velocity", "forecast"):
+            raise ValueError(f'`prior` must be "velocity" or "forecast", got {self.prior!r}')
         if self.start == "rest" and self.ego_motion is not None and self.ego_motion.path > 1:
             raise ValueError(f'`ego_motion.path` must be 1 with `start` "rest", got {self.ego_motion.path}')
         if not 0 < self.interval_s < float("inf"):
             raise ValueError(f"`interval_s` must be positive seconds, got {self.interval_s}")
+        if self.intervals_s is not None and not 0 < self.intervals_s[0] <= self.intervals_s[1] < float("inf"):
+            raise ValueError(f"`intervals_s` must be positive seconds that rise, got {self.intervals_s}")
         if self.refine.base != "none" and not self.render.colour:
             raise ValueError("`refine.base` adds to the rendered colour, so it needs `render.colour` (+colour)")
         if self.refine.base == "filled" and not self.render.normalised:
@@ -240,13 +259,14 @@ VEST_PAPER: Final = ModelConfig("vest-paper", render=RenderConfig(colour=False))
 VEST_S: Final = ModelConfig(
     "vest-s",
     encoder=EncoderConfig(widths=(24, 48, 96), blocks=(2, 2, 2), decoder=(48, 32), features=16, background="frame"),
-    ego_motion=EgoMotionConfig(widths=(32, 32, 64, 64), path=5),
+    ego_motion=EgoMotionConfig(widths=(32, 32, 64, 64), path=5, correction="bounded"),
     object_motion=ObjectMotionConfig(
         "dmvfn", scales=(4, 4, 2, 2, 1, 1), widths=(64, 64, 32, 32, 16, 16), detail=8, where="foreground"
     ),
     render=RenderConfig(rho=RHO_DIRECT, stretched=True, inpainted="inner", previous="uncovered", normalised=True),
     refine=RefineConfig(stem=16, stem_kernel=3, widths=(32, 64, 96, 128), base="filled"),
     start="prior",
+    prior="forecast",
 )
 
 #: The whole models, by name.
@@ -267,7 +287,7 @@ def _without_ego_motion(config: ModelConfig) -> ModelConfig:
 
 
 def _from_rest(config: ModelConfig) -> ModelConfig:
-    camera = config.ego_motion and dataclasses.replace(config.ego_motion, path=1)
+    camera = config.ego_motion and dataclasses.replace(config.ego_motion, path=1, correction="linear")
     return dataclasses.replace(config, ego_motion=camera, start="rest")
 
 

@@ -1,14 +1,17 @@
 """Ego-motion forecasting (EMF): how the camera will have moved by the next frame, from two backgrounds."""
 
-from typing import Final, NamedTuple, cast
+from typing import Final, cast
 
 import torch
 from torch import nn
 from torch.nn import functional
 
-from vestcl import geometry
 from vestcl.models._layers import frame_pair, frame_planes, side_by_side
+from vestcl.models.camera_correction import BoundedCorrection, CameraPrior, as_prior
 from vestcl.models.config import EgoMotionConfig
+from vestcl.models.rigid_motion import CameraMotion, RigidMotion
+
+__all__ = ["CameraMotion", "EgoMotion", "RigidMotion", "background_tokens", "sinusoidal_positions"]
 
 #: (stride, dilation) of the four convolutions: the one reading of the paper's table that agrees with its sizes.
 CONVOLUTIONS: Final = ((2, 1), (1, 2), (2, 1), (1, 1))
@@ -37,41 +40,6 @@ _REST: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _NUMBERS: Final = 6
 
 
-class RigidMotion(NamedTuple):
-    """``dst_from_src``: x_dst = R(q / |q|) x_src + t."""
-
-    quaternion: torch.Tensor
-    """[B, 4], (w, x, y, z), of any length."""
-    translation: torch.Tensor
-    """[B, 3] m."""
-
-    @classmethod
-    def rest(cls, like: torch.Tensor) -> "RigidMotion":
-        """No motion, for each image of ``like`` [B, ...]."""
-        return cls(like.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(like), 1), like.new_zeros(len(like), 3))
-
-    def inverse(self) -> "RigidMotion":
-        """x -> R^T (x - t)."""
-        quaternion = self.quaternion * self.quaternion.new_tensor([1.0, -1.0, -1.0, -1.0])
-        turned = (geometry.quaternion_to_matrix(quaternion) @ self.translation[..., None])[..., 0]
-        return RigidMotion(quaternion, -turned)
-
-    def after(self, first: "RigidMotion") -> "RigidMotion":
-        """x -> R (R_first x + t_first) + t."""
-        quaternion = geometry.quaternion_multiply(self.quaternion, first.quaternion)
-        turned = (geometry.quaternion_to_matrix(self.quaternion) @ first.translation[..., None])[..., 0]
-        return RigidMotion(quaternion, turned + self.translation)
-
-
-class CameraMotion(NamedTuple):
-    """The camera's way."""
-
-    next_from_prev: RigidMotion
-    next_from_cur: RigidMotion
-    later: tuple[RigidMotion, ...] = ()
-    """From t + 1 to t + 2, and so on, as far as it is forecast in one go; then the last one repeats."""
-
-
 class EgoMotion(nn.Module):
     """Two backgrounds -> the camera's motion from each of them to the next frame.
 
@@ -85,6 +53,9 @@ class EgoMotion(nn.Module):
     how a car sways on is nearly linear in how it did. Both are 0 at the start, and count by min(|t| / _ROLLING, 1), t
     the translation that was measured from t - 1 to t. The motions' numbers are added to every token, too.
     next_from_prev is G_1 after the measured motion from t - 1 to t.
+
+    With ``correction`` "bounded" D_k is a `BoundedCorrection` of a forecast motion G_k: the time between frames and
+    all motions that were measured are inputs, and D_k is the identity until training opens a gate.
 
     Source: SPEC section 4; the paper's section on ego-motion forecasting.
     """
@@ -105,7 +76,10 @@ class EgoMotion(nn.Module):
             AttentionBlock(tokens, config.heads, config.mlp_ratio) for _ in range(config.blocks)
         )
         self.norm = nn.LayerNorm(tokens)
-        self.shown, self.swayed = None, None
+        self.shown, self.swayed, self.bounded = None, None, None
+        if start == "prior" and config.correction == "bounded":
+            self.bounded = BoundedCorrection(config.path, tokens)
+            return
         if start == "prior":
             self.shown = nn.Linear(2 * _NUMBERS, tokens)
             self.swayed = nn.Linear(2 * _NUMBERS, config.path * _NUMBERS, bias=False)
@@ -126,7 +100,7 @@ class EgoMotion(nn.Module):
         depth_cur: torch.Tensor,
         mask_prev: torch.Tensor,
         mask_cur: torch.Tensor,
-        prior: tuple[RigidMotion, RigidMotion, RigidMotion] | None = None,
+        prior: CameraPrior | tuple[RigidMotion, RigidMotion, RigidMotion] | None = None,
     ) -> CameraMotion:
         """Forecast the camera's motion. All arguments are on the encoder's grid, h x w, of any size.
 
@@ -138,7 +112,7 @@ class EgoMotion(nn.Module):
             mask_prev: [B, 1, h, w], 1 where the frame itself shows static background.
             mask_cur: the same at t.
             prior: with ``start`` "prior" ``next_from_cur`` to start from, ``cur_from_prev`` as it was measured, and the
-                motion before that.
+                motion before that; a `CameraPrior` has more.
 
         Returns:
             The camera's motion; differentiable in all but the masks' choice of tokens.
@@ -169,33 +143,48 @@ class EgoMotion(nn.Module):
         grid_cur: torch.Tensor,
         mask_prev: torch.Tensor,
         mask_cur: torch.Tensor,
-        prior: tuple[RigidMotion, RigidMotion, RigidMotion] | None,
+        prior: CameraPrior | tuple[RigidMotion, RigidMotion, RigidMotion] | None,
     ) -> CameraMotion:
         """The second half of `forward`: the camera's motion from what `look` gives for both frames.
 
         Raises:
             ValueError: a prior missing or not asked for.
         """
-        if (prior is None) != (self.shown is None):
-            raise ValueError(f"`prior` must be {'none' if self.shown is None else 'given'} with this `start`")
+        starts_from_prior = self.shown is not None or self.bounded is not None
+        if (prior is None) == starts_from_prior:
+            raise ValueError(f"`prior` must be {'given' if starts_from_prior else 'none'} with this `start`")
         grid = torch.cat([grid_prev, grid_cur], dim=1)
-        tokens = (grid + sinusoidal_positions(grid)).flatten(2).mT
-        if prior is not None and self.shown is not None:
-            measured = torch.cat([_numbers(motion) for motion in prior[1:]], dim=1)
-            tokens = tokens + self.shown(measured)[:, None]
         looked_at = background_tokens(mask_prev, mask_cur, *grid.shape[-2:])
+        if prior is None:
+            first, second = self.motion(self._mean(grid, looked_at)).chunk(2, dim=1)
+            return CameraMotion(RigidMotion(first[:, :4], first[:, 4:]), RigidMotion(second[:, :4], second[:, 4:]))
+        known = as_prior(prior)
+        path = self._corrected(grid, looked_at, known)
+        return CameraMotion(path[0].after(known.cur_from_prev), path[0], tuple(path[1:]))
+
+    def _corrected(self, grid: torch.Tensor, looked_at: torch.Tensor, prior: CameraPrior) -> list[RigidMotion]:
+        """The camera's motion of each interval after t."""
+        if self.bounded is not None:
+            if self.bounded.changes_nothing and not torch.is_grad_enabled():
+                return [prior.interval(k) for k in range(max(self.bounded.path, prior.intervals))]
+            numbers = self.bounded.numbers(prior)
+            return self.bounded(self._mean(grid, looked_at, self.bounded.shown(numbers)), numbers, prior)
+        assert self.shown is not None and self.swayed is not None
+        measured = torch.cat([_numbers(motion) for motion in (prior.cur_from_prev, prior.prev_from_before)], dim=1)
+        said = self.motion(self._mean(grid, looked_at, self.shown(measured)))
+        rolling = torch.linalg.vector_norm(prior.cur_from_prev.translation, dim=1, keepdim=True) / _ROLLING
+        corrections = ((said + self.swayed(measured)) * rolling.clamp(max=1)).split(_NUMBERS, dim=1)
+        return [_correction(six).after(prior.interval(k)) for k, six in enumerate(corrections)]
+
+    def _mean(self, grid: torch.Tensor, looked_at: torch.Tensor, added: torch.Tensor | None = None) -> torch.Tensor:
+        """[B, tokens]: the mean token of what is ``looked_at``, with ``added`` [B, tokens] to each before attention."""
+        tokens = (grid + sinusoidal_positions(grid)).flatten(2).mT
+        if added is not None:
+            tokens = tokens + added[:, None]
         for block in self.blocks:
             tokens = block(tokens, looked_at)
         weights = looked_at.to(tokens.dtype) / looked_at.sum(dim=1, keepdim=True)
-        mean = (weights[:, None] @ self.norm(tokens))[:, 0]
-        said = self.motion(mean)
-        if prior is None or self.swayed is None:
-            first, second = said.chunk(2, dim=1)
-            return CameraMotion(RigidMotion(first[:, :4], first[:, 4:]), RigidMotion(second[:, :4], second[:, 4:]))
-        rolling = torch.linalg.vector_norm(prior[1].translation, dim=1, keepdim=True) / _ROLLING
-        corrections = ((said + self.swayed(measured)) * rolling.clamp(max=1)).split(_NUMBERS, dim=1)
-        path = [_correction(six).after(prior[0]) for six in corrections]
-        return CameraMotion(path[0].after(prior[1]), path[0], tuple(path[1:]))
+        return cast(torch.Tensor, (weights[:, None] @ self.norm(tokens))[:, 0])
 
 
 def _correction(said: torch.Tensor) -> RigidMotion:

@@ -10,7 +10,8 @@ from vestcl.models._clouds import as_image, as_points
 from vestcl.models._frames import FOREGROUND_BELOW
 from vestcl.models._layers import check
 from vestcl.models._render import RenderedView
-from vestcl.models.ego_motion import RigidMotion
+from vestcl.models.camera_correction import MEASURED, RATES, CameraPrior, rates_of
+from vestcl.models.rigid_motion import RigidMotion
 from vestcl.ops.unproject import unproject
 
 
@@ -33,6 +34,21 @@ class MotionPrior(NamedTuple):
     corrected: torch.Tensor | None = None
     """[B] bool, whether the networks correct it; None is True. They know the interval that they learned at: where any
     image has another one, motion is the prior's for all."""
+
+    later: RigidMotion | None = None
+    """[B, n, 4] and [B, n, 3]: the camera's of the n intervals after t + 1, extrapolated; then the last one that is
+    known repeats."""
+    measured: torch.Tensor | None = None
+    """[B, MEASURED, RATES], the last motions as `vestcl.models.camera_correction.rates_of` gives them, oldest first;
+    None is the two above."""
+    seconds: torch.Tensor | None = None
+    """[B] s, one interval of the clip; None is 0.1."""
+
+    @property
+    def camera(self) -> CameraPrior:
+        """What EMF starts from."""
+        known = self.next_from_cur, self.cur_from_prev, self.prev_from_before
+        return CameraPrior(*known, self.later, self.measured, self.seconds)
 
     @property
     def span(self) -> torch.Tensor | float:
@@ -58,9 +74,20 @@ def check_prior(prior: MotionPrior, like: torch.Tensor) -> None:
         ValueError: a tensor of another shape.
     """
     batch, _, height, width = like.shape
-    for name, number in (("intervals", prior.intervals), ("corrected", prior.corrected)):
+    numbers = (("intervals", prior.intervals), ("corrected", prior.corrected), ("seconds", prior.seconds))
+    for name, number in numbers:
         if number is not None and number.shape != (batch,):
             raise ValueError(f"`prior.{name}` must be [{batch}], got {list(number.shape)}")
+    if prior.measured is not None:
+        check(**{"prior.measured": (prior.measured, f"{batch} {MEASURED} {RATES}")})
+    if prior.later is not None:
+        later = prior.later.quaternion, prior.later.translation
+        check(
+            **{
+                "prior.later.quaternion": (later[0], f"{batch} n 4"),
+                "prior.later.translation": (later[1], f"{batch} n 3"),
+            }
+        )
     check(
         **{
             f"prior.{name}.{part}": (getattr(getattr(prior, name), part), f"{batch} {size}")
@@ -85,9 +112,16 @@ def beside(prior: MotionPrior, to_next: Sequence[RigidMotion]) -> torch.Tensor:
 
 
 def repeated(
-    prior: MotionPrior, next_from_cur: RigidMotion, moved: torch.Tensor, seen: RenderedView, K: torch.Tensor
+    prior: MotionPrior,
+    next_from_cur: RigidMotion,
+    moved: torch.Tensor,
+    seen: RenderedView,
+    K: torch.Tensor,
+    later: Sequence[RigidMotion] = (),
 ) -> MotionPrior:
-    """The prior of the step after: the camera's motion G once more, and what moved beside it as it did.
+    """The prior of the step after: the camera's motion G once more, and what moved next to it as it did.
+
+    A prior that has the motion of later intervals is followed by ``later``, as it was corrected.
 
     What is seen at x came m over the interval, so beside the camera by s = x - G (x - m), if it is foreground. The
     frame before has R^-1 of what its pixels moved beside the rigid flow.
@@ -98,12 +132,13 @@ def repeated(
         moved: [B, 3, H, W] m, of its current frame's pixels beside the rigid flow, in the next camera's axes.
         seen: its view from the source camera.
         K: [B, 3, 3] px.
+        later: the camera's motion of the intervals after, as they were forecast with G.
 
     Returns:
         The prior; no gradient.
     """
     height, width = seen.depth.shape[2:]
-    once = RigidMotion(*(part.detach() for part in next_from_cur))
+    once = _detached(next_from_cur)
     rigid = geometry.compose_rigid(*once)
     points = unproject(seen.depth.detach(), K)
     before = geometry.transform_points(rigid, points - as_points(seen.motion_xyz))
@@ -111,4 +146,18 @@ def repeated(
     known = (seen.depth > 0) & (seen.background < FOREGROUND_BELOW)
     velocity_prev = torch.einsum("bji,bjhw->bihw", rigid[:, :3, :3], moved.detach())
     velocity_cur = torch.where(known, velocity, 0)
-    return MotionPrior(once, once, prior.cur_from_prev, velocity_prev, velocity_cur, corrected=prior.corrected)
+    cameras = [once] if prior.later is None else [*(_detached(one) for one in later), once][: max(len(later), 1)]
+    rest = None
+    if prior.later is not None and len(cameras) > 1:
+        rest = RigidMotion(*(torch.stack(parts, dim=1) for parts in zip(*cameras[1:], strict=True)))
+    camera = prior.camera
+    latest = rates_of([once], camera.dt)[:, -1:]
+    measured = None if prior.measured is None else torch.cat([prior.measured[:, 1:], latest], dim=1)
+    return MotionPrior(
+        cameras[0], once, prior.cur_from_prev, velocity_prev, velocity_cur,
+        corrected=prior.corrected, later=rest, measured=measured, seconds=prior.seconds,
+    )  # fmt: skip
+
+
+def _detached(motion: RigidMotion) -> RigidMotion:
+    return RigidMotion(*(part.detach() for part in motion))
