@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vestcl import geometry
 from vestcl.data.resize import resize_image, resize_labels
+from vestcl.network_input import CameraPath
 from vestcl.prepared import Prepared
 from vestcl.scene.layers import Layers
 
@@ -52,6 +53,8 @@ class Window:
     """[4, 4] m: the camera's true motion from t to t + k; None where it is not known."""
     path_from_cur: tuple[Matrix, ...] = ()
     """The same to t + 1, t + 2 ...; none where a pose is unknown."""
+    path: CameraPath | None = None
+    """The camera's motion as it is forecast; None is constant velocity."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -139,6 +142,7 @@ def flip(window: Window) -> Window:
         tgt_from_next=_conjugate(turned.tgt_from_next),
         future_from_cur=None if turned.future_from_cur is None else _conjugate(turned.future_from_cur),
         path_from_cur=tuple(map(_conjugate, turned.path_from_cur)),
+        path=None if turned.path is None else _mirror_path(turned.path),
     )
 
 
@@ -245,6 +249,12 @@ def _mirror(planes: NDArray[Element]) -> NDArray[Element]:
 
 def _conjugate(dst_from_src: Matrix) -> Matrix:
     return _MIRROR @ dst_from_src @ _MIRROR
+
+
+def _mirror_path(path: CameraPath) -> CameraPath:
+    """A rotation vector (x, y, z) is (x, -y, -z) in the mirror, a translation (-x, y, z)."""
+    signs = np.array([1, -1, -1, -1, 1, 1, 1], np.float32)
+    return path._replace(future_from_cur=tuple(map(_conjugate, path.future_from_cur)), measured=path.measured * signs)
 
 
 def _mirror_motion(frame: Prepared) -> Prepared:

@@ -4,7 +4,7 @@ else: there is no state to save, ranks share a batch without talking, and a resu
 import functools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from train.augment import Window
 from train.config import DegradeConfig
 from vestcl.models._layers import joined
 from vestcl.models.prior import MotionPrior
-from vestcl.network_input import NetworkInput, last_motions, network_input
+from vestcl.network_input import PAST, CameraPath, NetworkInput, camera_path, last_motions, network_input
 from vestcl.prepared import PreparedClip
 from vestcl.scene.layers import LayerBatch
 
@@ -104,6 +104,9 @@ class WindowSet:
     """The group of each clip, from 0, where groups have weights."""
     weights: tuple[float, ...] = ()
     """How often windows are of each group; none shows each window as often."""
+    prior: Literal["velocity", "forecast"] = "velocity"
+    """What the camera's motion starts from, see `vestcl.models.config.ModelConfig.prior`. "forecast" takes up to `PAST`
+    measured motions and the clip's interval; of a clip's first frames there are fewer."""
 
     def __post_init__(self) -> None:
         if not self.clips:
@@ -150,6 +153,12 @@ class WindowSet:
         """Seconds from frame to frame, the median over the clips whose times are known; None without any."""
         known = [clip.interval for clip in self.clips if clip.interval is not None]
         return round(float(np.median(known)), 6) if known else None
+
+    @property
+    def intervals(self) -> tuple[float, float] | None:
+        """The shortest and the longest interval of the clips whose times are known; None without any."""
+        known = [round(clip.interval, 6) for clip in self.clips if clip.interval is not None]
+        return (min(known), max(known)) if known else None
 
     @property
     def shown(self) -> dict[str, tuple[int, int]]:
@@ -218,7 +227,8 @@ class WindowSet:
             raise ValueError(f"frame {clip.frame_name(later)} must be of size {clip.size}, got {image.shape[1:]}")
         here, there = clip.world_from_cam(draw.frame), clip.world_from_cam(later)
         future_from_cur = None if here is None or there is None else np.asarray(np.linalg.inv(there) @ here, np.float64)
-        return Window(prev, cur, image, K, tgt_from_next, future_from_cur, self._poses(clip, draw.frame))
+        path = self._path_of(draw.clip, draw.frame) if self.prior == "forecast" else None
+        return Window(prev, cur, image, K, tgt_from_next, future_from_cur, self._poses(clip, draw.frame), path)
 
     def augmented(self, window: Window, rng: np.random.Generator) -> Window:
         """Cut out, shrunk, mirrored and coloured as the settings say, by numbers from ``rng``."""
@@ -243,6 +253,22 @@ class WindowSet:
         """ "clip name/name of frame t"."""
         clip = self.clips[draw.clip]
         return f"{clip.name}/{clip.frame_name(draw.frame)}"
+
+    @functools.cached_property
+    def _forecast_paths(self) -> dict[tuple[int, int], CameraPath]:
+        """By clip and frame: a filter takes 20 ms, and every epoch would need it again."""
+        return {}
+
+    def _path_of(self, number: int, frame: int) -> CameraPath:
+        """The camera's forecast path from t = ``frame``, for as many intervals as there are horizons."""
+        if (number, frame) not in self._forecast_paths:
+            clip, first = self.clips[number], max(frame - PAST + 1, 1, 0 if self.frames is None else self.frames[0])
+            seen = range(min(first, frame), frame + 1)
+            motions = [np.asarray(np.linalg.inv(clip.prev_from_cur(i)), np.float64) for i in seen]
+            by_flow = clip.inputs is not None and clip.inputs.by_flow
+            path = camera_path(motions, list(map(clip.elapsed, seen)), clip.interval, len(self.horizons), by_flow)
+            self._forecast_paths[number, frame] = path
+        return self._forecast_paths[number, frame]
 
     def _poses(self, clip: PreparedClip, frame: int) -> tuple[NDArray[np.float64], ...]:
         """future_from_cur for k = 1 ... K; none where a pose is unknown."""
@@ -276,7 +302,8 @@ class WindowSet:
             window = self.augmented(window, np.random.default_rng(draw.seed))
             if done is not None:
                 window = degrade.degrade(window, done, rng)
-            return network_input(window.prev, window.cur, last_motions(window.prev, window.cur)), window
+            motions = last_motions(window.prev, window.cur)
+            return network_input(window.prev, window.cur, motions, window.path), window
         except (OSError, ValueError) as error:
             raise ValueError(f"{self.label(draw)}: {error}") from error
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Final
+from typing import Final, Literal
 
 import torch
 import tyro
@@ -33,8 +33,10 @@ from vestcl import command_line, interrupt, runtime
 from vestcl.data.splits import KITTI_TRAINING
 from vestcl.models._checkpoint import Frames, read_trained_on
 from vestcl.models._weights import misfit
+from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepared import find_prepared
+from vestcl.times import is_same
 
 #: The exit status of a run that was told to stop (SIGTERM), as a shell has it.
 STOPPED: Final = 128 + signal.SIGTERM
@@ -207,9 +209,8 @@ class _Run:
     def _train(self, trainer: Trainer, number: int, done: int) -> bool:
         """The rest of a stage, of which ``done`` updates are made; whether it was finished."""
         stage = trainer.stage
-        windows = window_set(self.config.data_of(stage))
-        learned = windows.interval or self.model.config.interval_s
-        self.model.config = dataclasses.replace(self.model.config, interval_s=learned)
+        windows = window_set(self.config.data_of(stage), self.model.config.prior)
+        self.model.config = with_intervals(self.model.config, windows)
         self.trained_on = merged(self.trained_on, windows.shown)
         steps = range(done, stage.steps)
         batches = loader(
@@ -293,8 +294,23 @@ def merged(frames: Frames, others: Frames) -> dict[str, tuple[int, int]]:
     return both
 
 
-def window_set(data: DataConfig) -> WindowSet:
+def with_intervals(config: ModelConfig, windows: WindowSet) -> ModelConfig:
+    """The configuration with the seconds between frames that ``windows`` have: the median, and the range over all
+    stages if EMF knows the time between frames and clips differ."""
+    learned, known = windows.interval or config.interval_s, [windows.intervals, config.intervals_s]
+    seconds = [each for pair in known if pair is not None for each in pair]
+    by_time = config.ego_motion is not None and config.ego_motion.correction == "bounded"
+    several = by_time and len(seconds) > 0 and not is_same(min(seconds), max(seconds))
+    range_s = (min(seconds), max(seconds)) if several else None
+    return dataclasses.replace(config, interval_s=learned, intervals_s=range_s)
+
+
+def window_set(data: DataConfig, prior: Literal["velocity", "forecast"] = "velocity") -> WindowSet:
     """The windows that a configuration's data hold.
+
+    Args:
+        data: of a stage.
+        prior: of the model, see `vestcl.models.config.ModelConfig.prior`.
 
     Raises:
         ValueError: no prepared clip there, none of the split, or none long enough.
@@ -309,7 +325,7 @@ def window_set(data: DataConfig) -> WindowSet:
     clips, groups = [clip for clip, _ in found], tuple(group for _, group in found)
     return WindowSet(
         clips, horizons=data.horizons, crop=data.crop, flip=data.flip, colour=data.colour, right=data.right,
-        frames=data.frames, scale=data.scale, degrade=data.degrade, groups=groups, weights=weights,
+        frames=data.frames, scale=data.scale, degrade=data.degrade, groups=groups, weights=weights, prior=prior,
     )  # fmt: skip
 
 

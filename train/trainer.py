@@ -52,7 +52,7 @@ def build_model(config: Config) -> Forecaster:
     if config.init is not None:
         given = Forecaster.load(config.init)
         try:
-            model.load_state_dict(given.state_dict())
+            model.load_state_dict(_fitting(given, model))
         except RuntimeError as error:
             raise ValueError(f"`init` must hold weights of {config.model}, got {config.init} ({error})") from error
     if config.init_encoder is not None:
@@ -62,6 +62,20 @@ def build_model(config: Config) -> Forecaster:
             raise ValueError(f"`init_encoder` must hold ResNet34's weights for {config.model} ({error})") from error
     model.autocast = _PRECISIONS[config.run.precision]
     return model.train()
+
+
+#: Of a model's state, what depends on how EMF corrects a prior.
+_HEADS: Final = tuple(f"ego_motion.{name}." for name in ("shown", "swayed", "motion", "bounded"))
+
+
+def _fitting(given: Forecaster, model: Forecaster) -> dict[str, torch.Tensor]:
+    """The weights of ``given``; where its EMF corrects a prior in another way, EMF's last layers are ``model``'s."""
+    pair = given.config.ego_motion, model.config.ego_motion
+    state = given.state_dict()
+    if None in pair or len({getattr(each, "correction", None) for each in pair}) == 1:
+        return state
+    kept = {name: tensor for name, tensor in state.items() if not name.startswith(_HEADS)}
+    return kept | {name: tensor for name, tensor in model.state_dict().items() if name.startswith(_HEADS)}
 
 
 def model_config(config: Config) -> ModelConfig:

@@ -122,6 +122,10 @@ class Forecast:
     --mask-model. Without it: estimated where one of these is given, else splatted."""
     quality: Literal["exact", "balanced", "fast"] | None = None
     """With --model: balanced (usual) is within 0.1 dB of exact in PSNR, fast not; docs/time_against_error has both."""
+    learned: Literal["tested", "all"] | None = None
+    """With --model, if it starts from what was measured: correct the geometric forecast by the learned parts that would
+    have improved it at the last frame (tested), or forecast by the network with all of them, untested. Without it:
+    tested."""
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Where to look from: source, right, left, or x,y,z[,yaw=][,pitch=][,roll=][,fov=][,name=], as in
     "0.5,0,0,yaw=-5": metres to the right of, below and ahead of the source camera, and degrees to the right, up and

@@ -40,6 +40,9 @@ Scores = dict[str, list[dict[str, float]]]
 #: The forecast, the first method of every comparison.
 FORECAST: Final = "forecast"
 
+#: dB of PSNR from which on one forecast counts as better than another: what tables show.
+LEAST_PSNR: Final = 0.01
+
 #: Metric -> how tables call it, with the digits that tell methods apart.
 METRICS: Final = {
     "psnr": ("PSNR, dB", ".2f"),

@@ -124,6 +124,8 @@ def check(options: "cli.Forecast") -> None:
         raise ValueError("`mode` is how a network goes on after its first step; it needs `model`")
     if options.perceive is not None and options.model is None:
         raise ValueError("`perceive` is how a network sees its own forecast; it needs `model`")
+    if options.learned is not None and options.model is None:
+        raise ValueError("`learned` is which learned parts of a network count; it needs `model`")
     if options.quality is not None and options.model is None:
         raise ValueError("`quality` is how exactly a network computes; it needs `model`")
 

@@ -43,6 +43,9 @@ MOST_STREET_FRAMES: Final = 10_000
 #: Steps in a table of scores, so that it fits 80 letters; forecast.json has all.
 STEPS_SHOWN: Final = 5
 
+#: Of ``learned``.
+DEFAULT_LEARNED: Final = "tested"
+
 #: Options that are passed on to the clip's reader, which knows whether it has them.
 _LAYOUT: Final = ("fov", "rig", "sequence", "snippet", "variant", "accumulated_depth")
 
@@ -101,7 +104,7 @@ def run(options: "cli.Forecast") -> None:
             st_lpips = None if options.st_lpips is None else StLpips.load(options.st_lpips)
         forecast = _forecast(clip, index, options, views, stages, inpaint, model, later)
         stages.seconds |= forecast.seconds
-        comparisons = []
+        comparisons, rival = list[Comparison](), None
         if options.compare:
             with stages.stage("compare") as report:
                 comparisons = compare.compare(forecast, clip, index, views, trunk, report, st_lpips, options.score_size)
@@ -116,6 +119,8 @@ def run(options: "cli.Forecast") -> None:
             write(options.out, told, clip, index, views, details)
     for comparison in comparisons:
         console.print(_score_table(comparison, later))
+        if rival is not None and (line := where_another_is_better(comparison, forecast.method, rival.method)):
+            console.print(Text(line), soft_wrap=True)
     _print_end(console, forecast_files.read_forecast(options.out))
 
 
@@ -261,7 +266,7 @@ def _forecast(
         return geometric.forecast_clip(*asked, progress=stages.show, **how)
     from vestcl import network
 
-    how["mode"] = later.mode
+    how |= {"mode": later.mode, "learned": options.learned or DEFAULT_LEARNED}
     if later.perceive is not None:
         how["perceive"] = later.perceive
     return network.forecast_clip(*asked, model, progress=stages.show, **how)
@@ -273,6 +278,25 @@ def _beside(comparison: Comparison, rival: Comparison, method: str) -> Compariso
     images = {own: comparison.images[own], method: rival.images[own], **comparison.images}
     scores = {own: comparison.scores[own], method: rival.scores[own], **comparison.scores}
     return dataclasses.replace(comparison, images=images, scores=scores)
+
+
+def where_another_is_better(comparison: Comparison, method: str, other: str) -> str | None:
+    """A line on the steps where ``other``, one of the methods, has the higher PSNR; None where it has at none.
+
+    Args:
+        comparison: of one view.
+        method: what the forecast is called.
+        other: the method.
+    """
+    pairs = [
+        (own["psnr"], theirs["psnr"])
+        for own, theirs in zip(comparison.scores[compare.FORECAST], comparison.scores[other], strict=True)
+    ]
+    better = [step for step, (own, theirs) in enumerate(pairs, start=1) if theirs - own >= compare.LEAST_PSNR]
+    if not better:
+        return None
+    steps = ", ".join(f"t+{step} ({pairs[step - 1][1]:.2f} against {pairs[step - 1][0]:.2f} dB)" for step in better)
+    return f"view {comparison.view}: {other} scored better than {method} in PSNR at {steps}"
 
 
 def _details(
@@ -296,6 +320,7 @@ def _details(
     settings = dataclasses.asdict(options)
     if options.model is not None and later is not None:
         chosen = {**later.settings, **quality.about(options.quality or quality.USUAL)}
+        chosen["learned"] = options.learned or DEFAULT_LEARNED
         settings |= chosen | pretrained.about_model(options.model)
     return forecast_files.Details(options.input, settings, scores, sheets)
 
@@ -339,6 +364,10 @@ def _print_end(console: Console, saved: forecast_files.SavedForecast) -> None:
             console.print(
                 Text(f"skipped, {switch}: {Skipped(*(one[name] for name in Skipped._fields))}"), soft_wrap=True
             )
+    for part, one in saved.about.get("learned", {}).items():
+        console.print(
+            Text(f"learned part {'used' if one['used'] else 'left out'}, {part}: {one['why']}"), soft_wrap=True
+        )
     for note in saved.about.get("notes", []):
         console.print(Text(f"note: {note}"), soft_wrap=True)
     for view in saved.about["views"].values():

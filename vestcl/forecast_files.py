@@ -271,6 +271,8 @@ def _about(forecast: Forecast, clip: Clip, index: int, details: Details) -> dict
     }
     if forecast.mode:
         about["mode"] = forecast.mode
+    if forecast.learned:
+        about["learned"] = {part: one._asdict() for part, one in forecast.learned.items()}
     if forecast.profile:
         about["profile"] = forecast.profile
     if forecast.skipped:

@@ -13,6 +13,9 @@ from vestcl.scene.inpaint import DEFAULT
 #: Depth that is matched where a frame has no other, and a right camera.
 PAIR: Final = "the stereo pair at t-1 and t"
 
+#: How the camera's motion is measured, at least.
+_BY_FLOW: Final = "optical flow"
+
 #: Depth maps that no camera has at time t.
 _ACCUMULATED: Final = "KITTI's depth maps, accumulated from scans of frames around each, later ones among them"
 
@@ -36,6 +39,11 @@ class Inputs:
     inpainting: str
     stereo: bool = False
     """Whether a depth is matched against the right camera's image at the same time."""
+
+    @property
+    def by_flow(self) -> bool:
+        """Whether the camera's motion is from optical flow only, without any depth."""
+        return self.motion == _BY_FLOW
 
     @classmethod
     def read(cls, entries: Any) -> "Inputs":
@@ -71,7 +79,7 @@ def inputs_of(
     classes = own_labels if mask_model is None else f"the classes of {mask_model}"
     depth = f"the estimator {depth_model}" if depth_model is not None else _depth(clip)
     own = any(sample.depth is not None for sample in clip)
-    motion = "optical flow" + (" and depth" if own or is_stereo(clip) else "")
+    motion = _BY_FLOW + (" and depth" if own or is_stereo(clip) else "")
     return Inputs(depth, classes if labelled else "motion", motion, inpaint or DEFAULT, is_stereo(clip))
 
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -9,16 +10,19 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, Skipped, View
+from vestcl.geometric.forecast import forecast_frames as forecast_geometric
 from vestcl.geometric.forecast import input_notes
+from vestcl.geometric.paths import point_paths
 from vestcl.geometric.perception import Perception
+from vestcl.learned import REFINEMENT, CorrectedPaths, Learned, chosen_motion, given_input, refined
+from vestcl.learned_backtest import choose_parts
 from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
 from vestcl.models.skipping import Count, Tally, count_skips
-from vestcl.network_input import NetworkInput, last_motions, network_input
+from vestcl.network_input import NetworkInput
 from vestcl.prepared import prepare_frame
 from vestcl.scene.inpainters import Inpainter
 from vestcl.stages import watching, with_rest
-from vestcl.times import is_same
 
 Progress = Callable[[str, float], None]
 
@@ -36,6 +40,7 @@ def forecast_clip(
     mode: Mode | None = None,
     perceive: Perceive | None = None,
     inpaint: Inpainter | None = None,
+    learned: Learned = "tested",
     progress: Progress | None = None,
 ) -> Forecast:
     """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` alone.
@@ -49,6 +54,7 @@ def forecast_clip(
         mode: how steps after the first are made, see `Forecaster.forecast`; None is the model's default.
         perceive: how forecast frames become inputs of mode "feedback", see `Forecaster.forecast`.
         inpaint: how the background behind the foreground of recorded frames is filled, see `Perception`.
+        learned: see `forecast_frames`.
         progress: called with the stage and the share of the work that is done.
 
     Returns:
@@ -57,15 +63,16 @@ def forecast_clip(
     Raises:
         ValueError: no such frame or none before it, no steps, no views, or a clip that depth can't be had for.
     """
-    done = [0]
+    composed = _is_composed(model.config, mode, learned)
+    done, total = [0], _STAGES + (steps * len(views) if composed else 0)
 
     def tell(stage: str) -> None:
         if progress:
-            progress(stage, min(done[0] / _STAGES, 1.0))
+            progress(stage, min(done[0] / total, 1.0))
         done[0] += 1
 
-    perception = Perception(clip, tell, inpaint=inpaint)
-    return forecast_frames(perception, model, index, steps, views, mode=mode, perceive=perceive, tell=tell)
+    how: dict[str, Any] = {"mode": mode, "perceive": perceive, "learned": learned, "tell": tell}
+    return forecast_frames(Perception(clip, tell, inpaint=inpaint), model, index, steps, views, **how)
 
 
 def forecast_frames(
@@ -77,9 +84,15 @@ def forecast_frames(
     *,
     mode: Mode | None = None,
     perceive: Perceive | None = None,
+    learned: Learned = "tested",
     tell: Callable[[str], None] = lambda stage: None,
 ) -> Forecast:
     """`forecast_clip` on a `Perception` that may have seen earlier frames already, and keeps what it sees.
+
+    A network that starts from what was measured corrects the geometric forecast: its camera's motion, its objects'
+    velocities, and its image. Each of these parts is used where it wins a test on frames up to t
+    (`vestcl.learned_backtest`); without any, the result is the geometric forecast. A network that starts from rest, and
+    mode "feedback", have all parts and no test.
 
     Args:
         perception: of the clip.
@@ -89,6 +102,7 @@ def forecast_frames(
         views: cameras to show each from.
         mode: see `forecast_clip`.
         perceive: see `forecast_clip`.
+        learned: "all" is the network's own forecast, as `Forecaster.forecast` has it, without a test.
         tell: called with the stage before the networks run.
 
     Raises:
@@ -99,7 +113,11 @@ def forecast_frames(
         raise ValueError(f"`index` must be 1 ... {len(clip) - 1}, a frame of {clip.name} with one before, got {index}")
     if steps < 1 or not views:
         raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
-    given, note = _given(perception, index, model.config)
+    if learned not in get_args(Learned):
+        raise ValueError(f'`learned` must be "tested" or "all", got {learned!r}')
+    if _is_composed(model.config, mode, learned):
+        return _composed(perception, model, index, steps, views, tell)
+    given, note = _given(perception, index, model.config, steps)
     tell("network")
     start = time.perf_counter()
     with torch.inference_mode(), watching() as watch, count_skips() as tally:
@@ -118,6 +136,63 @@ def forecast_frames(
     return Forecast(
         model.config.name, motions, frames, seconds, profile, skipped, notes, mode or model.config.default_mode
     )
+
+
+def _is_composed(config: ModelConfig, mode: Mode | None, learned: Learned) -> bool:
+    """Whether the network corrects the geometric forecast, in place of making one of its own."""
+    return learned == "tested" and config.start == "prior" and (mode or config.default_mode) == "compose"
+
+
+def _composed(
+    perception: Perception,
+    model: Forecaster,
+    index: int,
+    steps: int,
+    views: Sequence[View],
+    tell: Callable[[str], None],
+) -> Forecast:
+    """The geometric forecast with the learned parts that pass the test."""
+    note = interval_note(perception.clip, index, model.config)
+    known = note is None and interval_note(perception.clip, max(index - 1, 1), model.config) is None
+    paths = point_paths(perception, index)
+    prepare_frame(perception, index - 1)
+    tell("network")
+    clock = _Clock(perception)
+    with torch.inference_mode(), watching() as watch, count_skips() as tally:
+        with clock:
+            parts = choose_parts(perception, model, index, known)
+            motion = chosen_motion(perception, model, index, steps, parts)
+        moved = CorrectedPaths(paths.frame, paths.errors, paths.by_flow, motion.velocity_cur if motion.moves else None)
+        geometric = forecast_geometric(
+            perception, index, steps, views, future_from_cur=motion.cameras, paths=moved, tell=tell
+        )
+        frames = geometric.frames
+        if REFINEMENT in parts and parts[REFINEMENT].used:
+            with clock:
+                frames = refined(perception, model, index, motion, views, frames)
+    whole = clock.seconds
+    profile = with_rest(watch.take(), whole)
+    seconds = geometric.seconds | perception.seconds | {"network": whole}
+    notes = (*geometric.notes, *([] if note is None else [note]))
+    skipped = what_was_skipped(tally, profile)
+    return Forecast(model.config.name, list(motion.cameras), frames, seconds, profile, skipped, notes, "compose", parts)
+
+
+class _Clock:
+    """Seconds of the networks: of all blocks that it is entered for, less what perception took in them."""
+
+    def __init__(self, perception: Perception) -> None:
+        self.seconds = 0.0
+        self._perception = perception
+
+    def __enter__(self) -> None:
+        self.seconds -= self._now()
+
+    def __exit__(self, *error: object) -> None:
+        self.seconds += self._now()
+
+    def _now(self) -> float:
+        return time.perf_counter() - sum(self._perception.seconds.values())
 
 
 def what_was_skipped(tally: Tally, profile: Mapping[str, float]) -> dict[str, Skipped]:
@@ -153,17 +228,16 @@ def show_frame(perception: Perception, model: Forecaster, index: int, views: Seq
         index: the frame t, 1 or more.
         views: cameras at t, ``tgt_from_next`` from the source camera there.
     """
-    given, _ = _given(perception, index, model.config)
+    given, _ = _given(perception, index, model.config, 1)
     prior = given.prior if model.config.start == "prior" else None
     with torch.inference_mode():
         shown = model.present(given.frame_prev, given.frame_cur, given.K, cameras(views, given), prior, given.own)
     return dict(zip((view.name for view in views), map(_rendered, shown), strict=True))
 
 
-def _given(perception: Perception, index: int, config: ModelConfig) -> tuple[NetworkInput, str | None]:
+def _given(perception: Perception, index: int, config: ModelConfig, steps: int) -> tuple[NetworkInput, str | None]:
     """The two frames, and a line on the interval where it is another one than the network learned at."""
-    prev, cur = prepare_frame(perception, index - 1), prepare_frame(perception, index)
-    given, note = network_input(prev, cur, last_motions(prev, cur)), interval_note(perception.clip, index, config)
+    given, note = given_input(perception, index, config.prior, steps), interval_note(perception.clip, index, config)
     return given._replace(prior=given.prior._replace(corrected=torch.tensor([note is None]))), note
 
 
@@ -179,7 +253,7 @@ def interval_note(clip: Clip, index: int, config: ModelConfig) -> str | None:
     if clip.interval is None:
         return None
     gap = clip.interval * clip.elapsed(index)
-    wrong = next((seconds for seconds in (gap, clip.interval) if not is_same(seconds, config.interval_s)), None)
+    wrong = next((seconds for seconds in (gap, clip.interval) if not config.knows(seconds)), None)
     if wrong is None:
         return None
     if config.start == "prior":
@@ -187,7 +261,7 @@ def interval_note(clip: Clip, index: int, config: ModelConfig) -> str | None:
     else:
         consequence = "its motion may be wrong"
     what = "frames t-1 and t are" if wrong == gap != clip.interval else "frames are"
-    return f"{what} {wrong:.3g} s apart, {config.name} learned at {config.interval_s:g} s: {consequence}"
+    return f"{what} {wrong:.3g} s apart, {config.name} learned at {config.learned_at}: {consequence}"
 
 
 def cameras(views: Sequence[View], given: NetworkInput) -> list[tuple[torch.Tensor, torch.Tensor]]:

@@ -139,6 +139,16 @@ class PreparedClip:
         pose = self._frame(index).world_from_cam
         return None if pose is None else pose.copy()
 
+    def prev_from_cur(self, index: int) -> NDArray[np.float64]:
+        """[4, 4] m, the camera's motion to the frame before ``index``, from 1; nothing else of its file is read.
+
+        Raises:
+            ValueError: no such frame, none before it, or its file is missing or damaged.
+        """
+        if index == 0:
+            raise ValueError(f"`index` must have a frame before it, 1 ... {len(self) - 1}, got 0")
+        return np.asarray(self._read(index, "prev_from_cur")["prev_from_cur"], np.float64)
+
     def image(self, index: int) -> NDArray[np.float32]:
         """[3, H, W] RGB in [0, 1] of the frame ``index``, from 0; nothing else of its file is read.
 

@@ -72,6 +72,7 @@ def forecast_frames(
     views: Sequence[View],
     *,
     future_from_cur: Sequence[NDArray[np.float64]] | None = None,
+    paths: Paths | None = None,
     tell: Callable[[str], None] = lambda stage: None,
 ) -> Forecast:
     """`forecast_clip` on a `Perception` that may have seen earlier frames already, and keeps what it sees.
@@ -81,7 +82,8 @@ def forecast_frames(
         index: the current frame t.
         steps: frames to forecast.
         views: cameras to show each from.
-        future_from_cur: [4, 4] m a step, the camera's true motion from t, in place of constant velocity.
+        future_from_cur: [4, 4] m per step, the camera's motion from t, in place of the forecast one.
+        paths: of the points of frame t; None is `point_paths`.
         tell: called with the stage before each view.
 
     Raises:
@@ -96,7 +98,7 @@ def forecast_frames(
     cameras = forecast_cameras(perception, index, ahead) if future_from_cur is None else list(future_from_cur)
     if len(cameras) < steps:
         raise ValueError(f"`future_from_cur` must be of {steps} steps or more, got {len(cameras)}")
-    clouds = _clouds(perception, index, point_paths(perception, index))
+    clouds = _clouds(perception, index, paths or point_paths(perception, index))
     start, frames = time.perf_counter(), list[dict[str, Rendered]]()
     for step in ahead:
         moved = [cloud(step, [np.eye(4), *cameras]) for cloud in clouds]

@@ -229,6 +229,13 @@ class ModelConfig:
         return shortest <= seconds <= longest or is_same(seconds, shortest) or is_same(seconds, longest)
 
     @property
+    def learned_at(self) -> str:
+        """The seconds between frames that motion networks learned at: "0.1 s", or "0.033 to 0.125 s"."""
+        if self.intervals_s is None:
+            return f"{self.interval_s:g} s"
+        return "{:.3g} to {:.3g} s".format(*self.intervals_s)
+
+    @property
     def default_mode(self) -> Mode:
         """`mode`, or what follows from `start`."""
         return self.mode or ("feedback" if self.start == "rest" else "compose")
