@@ -1,0 +1,283 @@
+"""vestcl.learned and its backtest: a network corrects the geometric forecast by what would have improved it before."""
+
+import dataclasses
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from forecaster_scenes import SMALL, change, stir
+from torch import nn
+
+from vestcl import geometric, learned_backtest, network, pretrained
+from vestcl.data import Street
+from vestcl.data.sample import Clip
+from vestcl.forecast import LearnedPart, View
+from vestcl.geometric import Perception
+from vestcl.geometric.paths import forecast_cameras
+from vestcl.learned import corrections, forecast_path, given_input
+from vestcl.learned_backtest import choose_parts
+from vestcl.models.config import EgoMotionConfig
+from vestcl.models.forecaster import Forecaster
+
+HEIGHT, WIDTH = 48, 160
+RIGHT = np.eye(4)
+RIGHT[0, 3] = -0.54
+VIEWS = [View("source", np.eye(4)), View("right", RIGHT), View("again", np.eye(4))]
+
+#: As SMALL, with a bounded correction of the forecast motion.
+BOUNDED = dataclasses.replace(
+    SMALL,
+    prior="forecast",
+    ego_motion=EgoMotionConfig(widths=(8, 8, 8, 8), blocks=1, heads=2, path=3, correction="bounded"),
+)
+
+
+@functools.cache
+def clip() -> Clip:
+    return Street.generate(3).clip(7, HEIGHT, WIDTH)
+
+
+@functools.cache
+def perception() -> Perception:
+    return Perception(clip())
+
+
+def model(camera: float = 0.0, speed: float = 0.0) -> Forecaster:
+    """With a yaw of ``camera`` times the limit in every interval, and ``speed`` of that of the translation."""
+    torch.manual_seed(0)
+    made = Forecaster(BOUNDED).eval()
+    assert made.ego_motion is not None and made.ego_motion.bounded is not None
+    head = made.ego_motion.bounded
+    with torch.no_grad():
+        head.seen.weight.zero_()
+        head.swayed.weight.zero_()
+        said = torch.zeros(3, 6)
+        said[:, 1], said[:, 5] = np.arctanh(camera), np.arctanh(speed)
+        head.seen.bias.copy_(said.flatten())
+        head.gate.fill_(1.0 if camera or speed else 0.0)
+    return made
+
+
+def parts(made: Forecaster, index: int = 4, **how: Any) -> dict[str, LearnedPart]:
+    with torch.inference_mode():
+        return choose_parts(how.get("perception", perception()), made, index, how.get("known", True))
+
+
+def images(forecast: Any) -> list[np.ndarray]:
+    return [frame[name].image for frame in forecast.frames for name in frame]
+
+
+def assert_geometric(made: Any, index: int = 4) -> None:
+    wanted = geometric.forecast_frames(perception(), index, len(made.frames), VIEWS)
+    for one, other in zip(images(made), images(wanted), strict=True):
+        assert np.array_equal(one, other)
+    for got, pose in zip(made.future_from_cur, wanted.future_from_cur, strict=True):
+        np.testing.assert_array_equal(got, pose)
+
+
+# ---------------------------------------------------------------- the prior
+
+
+def test_the_prior_is_the_geometric_forecasts_camera() -> None:
+    """All intervals, at any frame; as measured they are the last four motions."""
+    for index in (1, 2, 5):
+        wanted = forecast_cameras(perception(), index, [1, 2, 3])
+        path = forecast_path(perception(), index, 3)
+        for got, pose in zip(path.future_from_cur, wanted, strict=True):
+            np.testing.assert_array_equal(got, pose)
+        assert int(path.measured[:, -1].sum()) == min(index, 4) and path.seconds == pytest.approx(0.1)
+        given = given_input(perception(), index, "forecast", 3)
+        with torch.inference_mode():
+            found = corrections(model(), given, 3)
+        for got, pose in zip(found.cameras, wanted, strict=True):
+            np.testing.assert_allclose(got, pose, atol=2e-5)
+
+
+# ---------------------------------------------------------------- the choice
+
+
+def test_a_network_that_adds_nothing_is_the_geometric_forecast() -> None:
+    """To the last bit: closed gates, object motion and refinement as they start."""
+    made = network.forecast_frames(perception(), model(), 4, 3, VIEWS)
+    assert_geometric(made)
+    assert made.method == "small" or made.method == BOUNDED.name
+    assert "camera" not in made.learned and not made.learned["refinement"].used
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_camera_that_is_worse_is_left_out(sign: int) -> None:
+    """One percent of yaw too much: the test has the numbers, and the forecast is the geometric one."""
+    made = network.forecast_frames(perception(), model(camera=0.9 * sign), 4, 2, VIEWS)
+    camera = made.learned["camera"]
+    assert not camera.used and camera.psnr is not None and camera.psnr_without is not None
+    assert camera.psnr < camera.psnr_without - 0.1 and f"{camera.psnr:.2f} dB at frame" in camera.why
+    assert_geometric(made)
+
+
+def test_a_camera_that_is_better_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The geometric forecast is wrong in yaw by what the network corrects: in both tests, and in the forecast."""
+    wrong = np.eye(4)
+    angle = 0.9 * 0.25 * 0.1
+    wrong[:3, :3] = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
+    from vestcl import learned
+
+    original = learned.camera_path
+
+    def off(*arguments: Any) -> Any:
+        path = original(*arguments)
+        futures, before, true = [], np.eye(4), np.eye(4)
+        for pose in path.future_from_cur:
+            before = wrong @ pose @ np.linalg.inv(true) @ before
+            futures.append(before)
+            true = pose
+        return path._replace(future_from_cur=tuple(futures))
+
+    monkeypatch.setattr(learned, "camera_path", off)
+    made = network.forecast_frames(perception(), model(camera=0.9), 4, 2, VIEWS)
+    camera = made.learned["camera"]
+    assert camera.used and camera.why.count("dB at frame") == 2
+    right = forecast_cameras(perception(), 4, [1, 2])
+    for got, pose in zip(made.future_from_cur, right, strict=True):
+        np.testing.assert_allclose(got, pose, atol=2e-3)
+
+
+def test_both_tests_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part that wins at t and loses at t - 1 is left out; one that loses at t is not tested again."""
+    asked = []
+
+    def tested(perception: Any, made: Any, index: int, wanted: Any, back: int) -> dict[str, LearnedPart]:
+        asked.append((index, tuple(wanted), back))
+        return {
+            part: LearnedPart(part != "objects" and (back == 1 or part == "camera"), f"at {index}") for part in wanted
+        }
+
+    monkeypatch.setattr(learned_backtest, "_tested", tested)
+    made = stir_all(model(camera=0.5))
+    found = parts(made)
+    assert asked == [(4, ("camera", "objects", "refinement"), 1), (3, ("camera", "refinement"), 2)]
+    assert {part: one.used for part, one in found.items()} == {"camera": True, "objects": False, "refinement": False}
+    assert found["refinement"].why == "at 4; at 3" and found["objects"].why == "at 4"
+
+
+def stir_all(made: Forecaster) -> Forecaster:
+    """Object motion and refinement add noise."""
+    assert made.object_motion is not None
+    for name, parameter in made.named_parameters():
+        if name.startswith(("object_motion", "refine")):
+            nn.init.normal_(parameter, std=0.05)
+    return made
+
+
+def test_noise_is_left_out() -> None:
+    made = network.forecast_frames(perception(), stir_all(model()), 4, 2, VIEWS)
+    assert not any(one.used for one in made.learned.values())
+    assert_geometric(made)
+
+
+def test_refinement_that_is_better_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the geometric image, in every view and step: what the network's own image has more than its base."""
+    noisy = stir_all(model())
+    monkeypatch.setattr(network, "choose_parts", lambda *_: {"refinement": LearnedPart(True, "", 30.0, 20.0)})
+    made = network.forecast_frames(perception(), noisy, 4, 2, VIEWS)
+    plain = geometric.forecast_frames(perception(), 4, 2, VIEWS)
+    given = given_input(perception(), 4, "forecast", 2)
+    with torch.inference_mode():
+        own = noisy.forecast(
+            given.frame_prev, given.frame_cur, given.K, 2, prior=given.prior._replace(corrected=torch.tensor([False]))
+        )
+        still = noisy.refine
+        nn.init.zeros_(list(still.parameters())[-1])
+        nn.init.zeros_(list(still.parameters())[-2])
+        base = noisy.forecast(
+            given.frame_prev, given.frame_cur, given.K, 2, prior=given.prior._replace(corrected=torch.tensor([False]))
+        )
+    for step in (0, 1):
+        added = (own[step].views[0].image - base[step].views[0].image)[0].numpy()
+        wanted = (plain.frames[step]["source"].image + added).clip(0, 1)
+        got = made.frames[step]["source"].image
+        inside = (own[step].views[0].image[0].numpy() > 0) & (own[step].views[0].image[0].numpy() < 1)
+        assert np.abs(got - wanted)[inside].max() < 1e-4 and np.abs(added).max() > 0.01
+        assert np.array_equal(got, made.frames[step]["again"].image)
+        assert not np.array_equal(made.frames[step]["right"].image, plain.frames[step]["right"].image)
+
+
+def test_only_frames_up_to_t_are_read() -> None:
+    """A later frame that can't be read changes nothing, nor does a clip that ends at t."""
+
+    def fail() -> Any:
+        raise AssertionError("a frame after t was read")
+
+    broken = SimpleNamespace(read=fail)
+    later = tuple(
+        dataclasses.replace(sample, image=broken, depth=broken, labels=broken) if i > 4 else sample
+        for i, sample in enumerate(clip())
+    )
+    noisy = stir_all(model(camera=0.3))
+    whole = network.forecast_frames(perception(), noisy, 4, 2, VIEWS)
+    for other in (dataclasses.replace(clip(), samples=later), clip()[:5]):
+        made = network.forecast_frames(Perception(other), noisy, 4, 2, VIEWS)
+        assert made.learned == whole.learned
+        assert all(np.array_equal(one, two) for one, two in zip(images(made), images(whole), strict=True))
+
+
+def test_what_was_seen_before_changes_nothing() -> None:
+    """A sequence that is worked through has the same choice as its frame alone."""
+    noisy, before = stir_all(model(camera=0.3)), Perception(clip())
+    for index in (3, 4):
+        network.forecast_frames(before, noisy, index, 1, VIEWS)
+    again = network.forecast_frames(before, noisy, 5, 1, VIEWS)
+    alone = network.forecast_frames(Perception(clip()), stir_all(model(camera=0.3)), 5, 1, VIEWS)
+    assert again.learned == alone.learned
+
+
+@pytest.mark.parametrize("index", [1, 2])
+def test_without_frames_to_test_on_parts_are_left_out(index: int) -> None:
+    made = network.forecast_frames(perception(), model(camera=0.5), index, 1, VIEWS)
+    assert {one.why for one in made.learned.values()} == {"there are too few frames before to test it on"}
+    assert_geometric(made, index)
+
+
+def test_a_network_of_another_interval_is_not_tested() -> None:
+    made = parts(stir_all(model(camera=0.5)), known=False)
+    assert made["camera"].why == made["objects"].why == "it learned at 0.1 s from frame to frame"
+    assert made["refinement"].psnr is not None
+
+
+def test_the_shipped_network_loads_and_says_why() -> None:
+    """vest-s learned to correct constant velocity: with all parts it forecasts as it did, tested it is left out."""
+    shipped = pretrained.load_model("vest-s")
+    assert shipped.config.prior == "velocity" and shipped.config.ego_motion is not None
+    assert shipped.config.ego_motion.correction == "linear"
+    found = parts(shipped)
+    assert not found["camera"].used and "constant velocity" in found["camera"].why
+
+
+# ---------------------------------------------------------------- turned off
+
+
+def test_all_parts_are_the_networks_own_forecast() -> None:
+    noisy = stir_all(model(camera=0.5))
+    made = network.forecast_frames(perception(), noisy, 4, 2, VIEWS, learned="all")
+    given = given_input(perception(), 4, "forecast", 2)
+    with torch.inference_mode():
+        own = noisy.forecast(given.frame_prev, given.frame_cur, given.K, 2, prior=given.prior, own=given.own)
+    for frame, step in zip(made.frames, own, strict=True):
+        assert np.array_equal(frame["source"].image, step.views[0].image[0].clamp(0, 1).numpy())
+    assert made.learned == {}
+    with pytest.raises(ValueError, match='`learned` must be "tested" or "all", got \'some\''):
+        network.forecast_frames(perception(), noisy, 4, 1, VIEWS, learned="some")  # type: ignore[arg-type]
+
+
+def test_models_from_rest_and_feedback_are_as_they_were() -> None:
+    torch.manual_seed(0)
+    rest = stir(Forecaster(change())).eval()
+    for made, mode in ((rest, None), (stir(Forecaster(SMALL)).eval(), "feedback")):
+        tested, every = (
+            network.forecast_frames(perception(), made, 4, 1, VIEWS, mode=mode, learned=learned)  # type: ignore[arg-type]
+            for learned in ("tested", "all")
+        )
+        assert tested.learned == {}
+        assert all(np.array_equal(one, two) for one, two in zip(images(tested), images(every), strict=True))
