@@ -99,7 +99,7 @@ def test_recursion_sees_what_it_is_given() -> None:
 def test_it_is_the_models_own_forecast(start: str, mode: Any) -> None:
     """On what was measured of frames t - 1 and t; a model that starts from rest is told no prior."""
     network = model(start)
-    result = forecast_frames(perception(), network, 2, 2, VIEWS, mode=mode)
+    result = forecast_frames(perception(), network, 2, 2, VIEWS, mode=mode, learned="all")
     prev, cur = (prepare_frame(perception(), index) for index in (1, 2))
     given = network_input(prev, cur, last_motions(prev, cur))
     cameras = [(torch.from_numpy(view.tgt_from_next).float()[None], given.K) for view in VIEWS]
@@ -132,8 +132,8 @@ def test_a_forecast_tells_its_stages_and_what_it_skipped() -> None:
     """Of this forecast alone; the model is as it was."""
     network = model()
     views = [*VIEWS, View("again", np.eye(4))]
-    first = forecast_frames(perception(), network, 2, 1, views)
-    again = forecast_frames(perception(), network, 2, 1, views)
+    first = forecast_frames(perception(), network, 2, 1, views, learned="all")
+    again = forecast_frames(perception(), network, 2, 1, views, learned="all")
     assert not {*STAGES} & {*vars(network)}
     for result, known in ((first, 0), (again, 2)):
         assert list(result.profile) == [*STAGES.values(), REST]
@@ -180,15 +180,17 @@ def test_a_view_may_have_a_camera_of_its_own() -> None:
     assert not np.array_equal(shown["plain"].image, shown["closer"].image)
 
 
-def test_a_clip_is_perceived_and_told_of() -> None:
-    """Stages are told with shares that grow to nearly 1; no later frame is looked at."""
+@pytest.mark.parametrize("learned", ["tested", "all"])
+def test_a_clip_is_perceived_and_told_of(learned: Any) -> None:
+    """Stages are reported with shares that grow to nearly 1; no later frame is looked at."""
     told: list[tuple[str, float]] = []
-    result = forecast_clip(clip(), 2, 1, VIEWS, model(), progress=lambda stage, share: told.append((stage, share)))
-    assert_same(result, forecast_frames(perception(), model(), 2, 1, VIEWS))
+    how: dict[str, Any] = {"learned": learned, "progress": lambda stage, share: told.append((stage, share))}
+    result = forecast_clip(clip(), 2, 1, VIEWS, model(), **how)
+    assert_same(result, forecast_frames(perception(), model(), 2, 1, VIEWS, learned=learned))
     shares = [share for _, share in told]
     assert shares == sorted(shares) and shares[0] == 0 and 0.8 < shares[-1] <= 1
-    assert told[-1][0] == "network" and len({stage for stage, _ in told}) > 3
-    short = forecast_clip(clip()[:3], 2, 1, VIEWS, model())
+    assert told[-1][0] == ("network" if learned == "all" else "render") and len({stage for stage, _ in told}) > 3
+    short = forecast_clip(clip()[:3], 2, 1, VIEWS, model(), learned=learned)
     assert_same(short, result)
 
 

@@ -142,7 +142,7 @@ def test_two_forecasts_at_once_on_one_model(quick: bool) -> None:
 
     def task(network: Forecaster, number: int) -> Forecast:
         steps, views = ((2, few), (3, many))[number]
-        return forecast_frames(perceptions[number], network, 2, steps, views)
+        return forecast_frames(perceptions[number], network, 2, steps, views, learned="all")
 
     wanted = [task(copy.deepcopy(network), number) for number in range(2)]
     before = dict(vars(network))

@@ -149,7 +149,7 @@ def test_another_interval_than_the_networks() -> None:
     """vest-s learned at 10 Hz: its corrections of motion are left out, and a line says so."""
     model = pretrained.load_model("vest-s")
     clip = dataclasses.replace(fine(), samples=fine().samples[:4]).resized(48, 160)
-    made = network.forecast_frames(Perception(clip), model, 3, 2, [SOURCE])
+    made = network.forecast_frames(Perception(clip), model, 3, 2, [SOURCE], learned="all")
     measured = [np.linalg.inv(Perception(clip).prev_from_cur(index)) for index in (2, 3)]
     plain = [np.linalg.matrix_power(constant_velocity(measured), step) for step in (1, 2)]
     (note,) = made.notes

@@ -36,7 +36,6 @@ from vestcl.models._weights import misfit
 from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepared import find_prepared
-from vestcl.times import is_same
 
 #: The exit status of a run that was told to stop (SIGTERM), as a shell has it.
 STOPPED: Final = 128 + signal.SIGTERM
@@ -295,13 +294,12 @@ def merged(frames: Frames, others: Frames) -> dict[str, tuple[int, int]]:
 
 
 def with_intervals(config: ModelConfig, windows: WindowSet) -> ModelConfig:
-    """The configuration with the seconds between frames that ``windows`` have: the median, and the range over all
-    stages if EMF knows the time between frames and clips differ."""
+    """The configuration with the seconds between frames that ``windows`` have: the median, and if EMF knows the time
+    between frames the range over all stages."""
     learned, known = windows.interval or config.interval_s, [windows.intervals, config.intervals_s]
     seconds = [each for pair in known if pair is not None for each in pair]
     by_time = config.ego_motion is not None and config.ego_motion.correction == "bounded"
-    several = by_time and len(seconds) > 0 and not is_same(min(seconds), max(seconds))
-    range_s = (min(seconds), max(seconds)) if several else None
+    range_s = (min(seconds), max(seconds)) if by_time and seconds else None
     return dataclasses.replace(config, interval_s=learned, intervals_s=range_s)
 
 

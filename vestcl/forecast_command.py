@@ -266,7 +266,9 @@ def _forecast(
         return geometric.forecast_clip(*asked, progress=stages.show, **how)
     from vestcl import network
 
-    how |= {"mode": later.mode, "learned": options.learned or DEFAULT_LEARNED}
+    how["mode"] = later.mode
+    if options.learned is not None:
+        how["learned"] = options.learned
     if later.perceive is not None:
         how["perceive"] = later.perceive
     return network.forecast_clip(*asked, model, progress=stages.show, **how)

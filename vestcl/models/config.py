@@ -231,7 +231,7 @@ class ModelConfig:
     @property
     def learned_at(self) -> str:
         """The seconds between frames that motion networks learned at: "0.1 s", or "0.033 to 0.125 s"."""
-        if self.intervals_s is None:
+        if self.intervals_s is None or self.intervals_s[0] == self.intervals_s[1]:
             return f"{self.interval_s:g} s"
         return "{:.3g} to {:.3g} s".format(*self.intervals_s)
 
