@@ -52,9 +52,8 @@ def test_all_parts_untested(
     assert about["settings"]["learned"] == "all" and "learned" not in about
     first = {method: about["scores"]["source"][method][0]["psnr"] for method in ("forecast", "geometric")}
     assert first["geometric"] > first["forecast"]
-    line = (
-        f"view source: geometric scored better than {about['method']} in PSNR at t+1 ({first['geometric']:.2f} against"
-    )
+    numbers = f"t+1 ({first['geometric']:.2f} against {first['forecast']:.2f} dB)"
+    line = f"view source: geometric scored better than {about['method']} in PSNR at {numbers}"
     assert line in said
 
 

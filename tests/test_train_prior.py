@@ -24,7 +24,7 @@ from vestcl.inputs import Inputs
 from vestcl.models import config
 from vestcl.models.config import EgoMotionConfig
 from vestcl.models.forecaster import Forecaster
-from vestcl.network_input import camera_path
+from vestcl.network_input import camera_path, last_motions, network_input
 from vestcl.prepared import Prepared, PreparedClip
 from vestcl.scene.motion.camera_forecast import forecast_camera
 
@@ -148,8 +148,12 @@ def test_the_mirrored_path() -> None:
 
 
 def test_models_of_constant_velocity_see_what_they_saw() -> None:
-    prior = windows(Driving(0.1), prior="velocity").batch([Draw(0, 5, 1, False, (0,))]).prior
-    assert prior.later is None and prior.measured is None and prior.seconds is None
+    clip = Driving(0.1)
+    prior = windows(clip, prior="velocity").batch([Draw(0, 5, 1, False, (0,))]).prior
+    assert prior.camera.intervals == 1
+    wanted = network_input(clip.frame(4), clip.frame(5), last_motions(clip.frame(4), clip.frame(5))).prior
+    for got, motion in zip(prior.next_from_cur, wanted.next_from_cur, strict=True):
+        assert torch.equal(got, motion)
 
 
 def test_the_configuration_has_the_intervals_of_all_stages() -> None:

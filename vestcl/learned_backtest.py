@@ -81,8 +81,8 @@ def choose_parts(perception: Perception, model: Forecaster, index: int, known_in
         chosen |= {part: LearnedPart(False, reason) for part in tested if part != REFINEMENT}
     tested = [part for part in tested if part not in chosen]
     for at in (index, index - 1):
-        if reason := _untestable(perception, at):
-            return chosen | {part: LearnedPart(False, reason) for part in tested}
+        if fault := _untestable(perception, at):
+            return chosen | {part: LearnedPart(False, fault) for part in tested}
     found = _tested(perception, model, index, tested, 1)
     won = [part for part in tested if part in found and found[part].used]
     again = _tested(perception, model, index - 1, won, 2) if won else {}

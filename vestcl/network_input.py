@@ -1,6 +1,7 @@
 """What is known of two frames, as the networks take it: layers, the camera, and the motion as measurements extrapolate
 it."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -85,6 +86,8 @@ def network_input(
     elapsed[-2:] = [prev.elapsed, cur.elapsed][-len(motions) :]
     next_from_cur = constant_velocity(motions, elapsed) if path is None else path.future_from_cur[0]
     next_from_prev = next_from_cur @ motions[-1]
+    if path is None:
+        path = CameraPath((next_from_cur,), _measured(motions, [each * INTERVAL for each in elapsed]), INTERVAL)
     prior = MotionPrior(
         as_motion(next_from_cur),
         as_motion(motions[-1]),
@@ -93,7 +96,9 @@ def network_input(
         torch.from_numpy(_velocity(cur, next_from_cur, 1)[None]),
         torch.tensor([1 + cur.elapsed]),
         torch.tensor([True]),
-        *(() if path is None else (_later(path), torch.from_numpy(path.measured[None]), torch.tensor([path.seconds]))),
+        _later(path.future_from_cur),
+        torch.from_numpy(path.measured[None]),
+        torch.tensor([path.seconds]),
     )
     own = torch.from_numpy((prev.own | cur.own)[None]).float()
     return NetworkInput(batch([prev.layers]), batch([cur.layers]), torch.from_numpy(cur.K[None]).float(), prior, own)
@@ -122,15 +127,22 @@ def camera_path(
     dt = seconds or INTERVAL
     motions, times = motions[-PAST:], [dt * each for each in elapsed[-PAST:]]
     cameras = forecast_camera(motions, times, [dt * step for step in range(1, steps + 1)], by_flow)
-    measured = rates_of([as_motion(np.asarray(motion, np.float64)) for motion in motions], torch.tensor([times]))
-    return CameraPath(tuple(cameras), measured[0].numpy(), dt)
+    return CameraPath(tuple(cameras), _measured(motions, times), dt)
 
 
-def _later(path: CameraPath) -> RigidMotion | None:
+def _measured(motions: Sequence[NDArray[np.float64]], seconds: Sequence[float]) -> NDArray[np.float32]:
+    """[MEASURED, RATES], see `rates_of`."""
+    known = [as_motion(np.asarray(motion, np.float64)) for motion in motions]
+    return rates_of(known, torch.tensor([list(seconds)]))[0].numpy()
+
+
+def _later(future_from_cur: Sequence[NDArray[np.float64]]) -> RigidMotion:
     """The motions of the intervals after the first, [1, n, 4] and [1, n, 3]."""
-    pairs = zip(path.future_from_cur[1:], path.future_from_cur, strict=False)
-    each = [as_motion(np.asarray(later @ np.linalg.inv(before), np.float64)) for later, before in pairs]
-    return RigidMotion(*(torch.stack(parts, dim=1) for parts in zip(*each, strict=True))) if each else None
+    pairs = itertools.pairwise(future_from_cur)
+    each = [as_motion(np.asarray(later @ np.linalg.inv(before), np.float64)) for before, later in pairs]
+    if not each:
+        return RigidMotion(torch.zeros(1, 0, 4), torch.zeros(1, 0, 3))
+    return RigidMotion(*(torch.stack(parts, dim=1) for parts in zip(*each, strict=True)))
 
 
 def last_motions(*frames: Prepared) -> list[NDArray[np.float64]]:

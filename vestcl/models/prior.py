@@ -80,7 +80,7 @@ def check_prior(prior: MotionPrior, like: torch.Tensor) -> None:
             raise ValueError(f"`prior.{name}` must be [{batch}], got {list(number.shape)}")
     if prior.measured is not None:
         check(**{"prior.measured": (prior.measured, f"{batch} {MEASURED} {RATES}")})
-    if prior.later is not None:
+    if prior.later is not None and (prior.later.quaternion.numel() or prior.later.translation.numel()):
         later = prior.later.quaternion, prior.later.translation
         check(
             **{
@@ -146,9 +146,10 @@ def repeated(
     known = (seen.depth > 0) & (seen.background < FOREGROUND_BELOW)
     velocity_prev = torch.einsum("bji,bjhw->bihw", rigid[:, :3, :3], moved.detach())
     velocity_cur = torch.where(known, velocity, 0)
-    cameras = [once] if prior.later is None else [*(_detached(one) for one in later), once][: max(len(later), 1)]
+    follows = prior.camera.intervals > 1 and len(later) > 0
+    cameras = [_detached(one) for one in later] if follows else [once]
     rest = None
-    if prior.later is not None and len(cameras) > 1:
+    if len(cameras) > 1:
         rest = RigidMotion(*(torch.stack(parts, dim=1) for parts in zip(*cameras[1:], strict=True)))
     camera = prior.camera
     latest = rates_of([once], camera.dt)[:, -1:]
