@@ -151,7 +151,9 @@ def setup_of(config: Evaluation, protocol: Protocol) -> Setup:
     size, steps = protocol.size, protocol.steps
     how = Preprocessing.load(config.depth_model, config.mask_model, config.inpaint)
     networks = trunk, lpips, shift_tolerant, flow
-    setup = Setup(protocol, size, steps, models, config.mode, config.stereo, *networks, how, config.perceive)
+    setup = Setup(
+        protocol, size, steps, models, config.mode, config.stereo, *networks, how, config.perceive, config.learned
+    )
     _ = setup.later  # refuses what can't be perceived, before the work begins
     return setup
 

@@ -8,6 +8,7 @@ import tyro
 
 from train.protocols import HELD_OUT, Name
 from vestcl.later_frames import Perceived
+from vestcl.learned import Learned
 from vestcl.models.forecaster import Mode
 from vestcl.st_lpips import Option as StLpipsOption
 
@@ -55,6 +56,9 @@ class Evaluation:
     perceive: Perceived | None = None
     """With mode feedback: depth and mask of forecast frames are splatted, or estimated by --depth-model and
     --mask-model. Without it: estimated where one of these is given, else splatted."""
+    learned: Learned = "tested"
+    """Models that start from what was measured correct the geometric forecast by the learned parts that win a test on
+    the frames before (tested), as `vestcl forecast` does, or forecast by themselves with all parts (all)."""
     depth_model: str | None = None
     """Estimate depth by this checkpoint (a folder, or a name on huggingface.co)."""
     mask_model: str | None = None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from train.evaluate_inputs import Preprocessing
 from train.protocols import Protocol
 from vestcl.later_frames import LaterFrames, Perceived, later_frames
+from vestcl.learned import Learned
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.trunks import Trunk
 from vestcl.models.voxel_flow import VoxelFlowNetwork
@@ -36,6 +37,8 @@ class Setup:
     preprocessing: Preprocessing = field(default_factory=Preprocessing)
     perceive: Perceived | None = None
     """Where depth and mask of forecast frames come from, of models whose mode is "feedback"."""
+    learned: Learned = "tested"
+    """Which learned parts count, see `vestcl.network.forecast_frames`."""
 
     @property
     def modes(self) -> dict[str, Mode]:

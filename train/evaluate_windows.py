@@ -25,6 +25,7 @@ from vestcl.geometric import Perception, show_frame
 from vestcl.inputs import Inputs
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.later_frames import LaterFrames
+from vestcl.learned import Learned
 from vestcl.models.forecaster import Forecaster
 from vestcl.scoring import (
     GEOMETRIC,
@@ -234,15 +235,22 @@ def forecast(perception: Perception, index: int, views: Sequence[View], setup: S
         setup: models, peer, mode and steps.
     """
     models: dict[str, Method] = {
-        name: functools.partial(_network_forecasts, model, setup.later[name]) for name, model in setup.models.items()
+        name: functools.partial(_network_forecasts, model, setup.later[name], setup.learned)
+        for name, model in setup.models.items()
     }
     return forecasts_of(perception, index, setup.steps, views, models, setup.peer)
 
 
 def _network_forecasts(
-    model: Forecaster, later: LaterFrames, perception: Perception, index: int, steps: int, views: Sequence[View]
+    model: Forecaster,
+    later: LaterFrames,
+    learned: Learned,
+    perception: Perception,
+    index: int,
+    steps: int,
+    views: Sequence[View],
 ) -> Forecast:
-    how: dict[str, Any] = {"mode": later.mode, "perceive": later.perceive}
+    how: dict[str, Any] = {"mode": later.mode, "perceive": later.perceive, "learned": learned}
     return network.forecast_frames(perception, model, index, steps, views, **how)
 
 
