@@ -240,6 +240,20 @@ def test_without_frames_to_test_on_parts_are_left_out(index: int) -> None:
     assert_geometric(made, index)
 
 
+@pytest.mark.parametrize(
+    ("elapsed", "lost", "words"),
+    [
+        ({4: 1.0, 3: 1.0}, (), "None"),
+        ({4: 1.5, 3: 1.0}, (), "not evenly spaced"),
+        ({4: 1.0, 3: 2.0}, (), "not evenly spaced"),
+        ({4: 1.0, 3: 1.0}, (3,), "a gap before the last frames"),
+    ],
+)
+def test_uneven_frames_are_no_test(elapsed: dict[int, float], lost: tuple[int, ...], words: str) -> None:
+    seen: Any = SimpleNamespace(clip=SimpleNamespace(elapsed=elapsed.__getitem__), is_lost=lost.__contains__)
+    assert words in str(learned_backtest._untestable(seen, 4))
+
+
 def test_a_network_of_another_interval_is_not_tested() -> None:
     made = parts(stir_all(model(camera=0.5)), known=False)
     assert made["camera"].why == made["objects"].why == "it learned at 0.1 s from frame to frame"

@@ -170,8 +170,9 @@ def _composed(
         if REFINEMENT in parts and parts[REFINEMENT].used:
             with clock:
                 frames = refined(perception, model, index, motion, views, frames)
-    whole = clock.seconds
-    profile = with_rest(watch.take(), whole)
+    stages = watch.take()
+    whole = max(clock.seconds, sum(stages.values()))  # another thread's perception is not in the networks' time
+    profile = with_rest(stages, whole)
     seconds = geometric.seconds | perception.seconds | {"network": whole}
     notes = (*geometric.notes, *([] if note is None else [note]))
     skipped = what_was_skipped(tally, profile)
