@@ -5,6 +5,7 @@ import functools
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -16,8 +17,8 @@ from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.forecast import LearnedPart, View
 from vestcl.geometric import Perception
-from vestcl.geometric.paths import forecast_cameras
-from vestcl.learned import corrections, forecast_path, given_input
+from vestcl.geometric.paths import forecast_cameras, point_paths
+from vestcl.learned import CorrectedPaths, corrections, forecast_path, given_input
 from vestcl.learned_backtest import choose_parts
 from vestcl.models.config import EgoMotionConfig
 from vestcl.models.forecaster import Forecaster
@@ -138,28 +139,74 @@ def test_a_camera_that_is_better_is_used(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(learned, "camera_path", off)
     made = network.forecast_frames(perception(), model(camera=0.9), 4, 2, VIEWS)
     camera = made.learned["camera"]
-    assert camera.used and camera.why.count("dB at frame") == 2
+    assert camera.used and camera.why.count("dB at frame") == 3 and "from 2 frames before" in camera.why
     right = forecast_cameras(perception(), 4, [1, 2])
     for got, pose in zip(made.future_from_cur, right, strict=True):
         np.testing.assert_allclose(got, pose, atol=2e-3)
 
 
-def test_both_tests_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A part that wins at t and loses at t - 1 is left out; one that loses at t is not tested again."""
+def test_all_tests_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At t, at t - 1, and for motion two frames ahead; what loses one is left out and tested no further."""
     asked = []
 
-    def tested(perception: Any, made: Any, index: int, wanted: Any, back: int) -> dict[str, LearnedPart]:
-        asked.append((index, tuple(wanted), back))
-        return {
-            part: LearnedPart(part != "objects" and (back == 1 or part == "camera"), f"at {index}") for part in wanted
-        }
+    def tested(perception: Any, made: Any, start: int, ahead: int, back: int, wanted: Any) -> dict[str, LearnedPart]:
+        asked.append((start, ahead, back, tuple(wanted)))
+        used = {"camera": ahead == 1, "objects": back == 1, "refinement": True}
+        return {part: LearnedPart(used[part], f"{start} {ahead}") for part in wanted}
 
     monkeypatch.setattr(learned_backtest, "_tested", tested)
-    made = stir_all(model(camera=0.5))
-    found = parts(made)
-    assert asked == [(4, ("camera", "objects", "refinement"), 1), (3, ("camera", "refinement"), 2)]
-    assert {part: one.used for part, one in found.items()} == {"camera": True, "objects": False, "refinement": False}
-    assert found["refinement"].why == "at 4; at 3" and found["objects"].why == "at 4"
+    found = parts(stir_all(model(camera=0.5)))
+    every = ("camera", "objects", "refinement")
+    assert asked == [(3, 1, 1, every), (2, 1, 2, every), (2, 2, 2, ("camera",))]
+    assert {part: one.used for part, one in found.items()} == {"camera": False, "objects": False, "refinement": True}
+    assert [found[part].why for part in every] == ["3 1; 2 1; 2 2", "3 1; 2 1", "3 1; 2 1"]
+
+
+@pytest.mark.parametrize("ahead", [1, 2])
+def test_the_test_by_hand(ahead: int) -> None:
+    """A wall 8 m away that moves 3 px an interval with the camera, at a pixel each: right at the true motion only."""
+    rng = np.random.default_rng(0)
+    strip = cv2.GaussianBlur(rng.random((40, 200), np.float32), (0, 0), 2.0)
+    image, prev = (np.stack([strip[:, at : at + 80]] * 3) for at in (3 * ahead, 0))
+    K = np.array([[40.0, 0, 40], [0, 40, 20], [0, 0, 1]])
+    planes = np.full((1, 40, 80), 8, np.float32), np.zeros((3, 40, 80), np.float32), np.ones((40, 80), bool)
+    test = learned_backtest._Test("f", image, prev, *planes, K, ahead, 1)
+    true, still = np.eye(4), np.eye(4)
+    true[0, 3] = -3 * ahead * 8 / 40
+    found = test.verdict(test.positions(still), test.positions(true))
+    assert found.used and found.psnr is not None and found.psnr > 60 and (found.psnr_without or 99) < 30
+    assert not test.verdict(test.positions(true), test.positions(still)).used
+    assert not test.verdict(test.positions(true), test.positions(true)).used  # no better is not enough
+    velocity = np.zeros((3, 40, 80), np.float32)
+    velocity[0] = -3 * 8 / 40
+    moved = test.verdict(test.positions(still), test.positions(still, velocity), where=velocity[0] != 0)
+    assert moved.used and moved.psnr == pytest.approx(found.psnr, abs=0.1)
+    brighter = test.verdict(test.positions(true), test.positions(true), added=np.full_like(image, 0.1))
+    assert not brighter.used
+    nowhere = test.verdict(test.positions(still), test.positions(true), where=np.zeros((40, 80), bool))
+    assert nowhere == LearnedPart(False, "what it changes is too small to be tested")
+
+
+def test_corrected_velocities_move_points_further() -> None:
+    """R n v, on top of what the candidates say; at n = 0 nothing."""
+    paths = point_paths(perception(), 4)
+    more = np.zeros_like(paths.frame.velocity)
+    more[:, 10:20, 30:60] = np.array([0.5, 0.0, -0.25], np.float32)[:, None, None]
+    corrected = CorrectedPaths(paths.frame, paths.errors, paths.by_flow, more)
+    future = forecast_cameras(perception(), 4, [3])[0]
+    wanted = paths.at(3, future) + np.einsum("ij,jhw->ihw", future[:3, :3], 3 * more.astype(np.float64))
+    np.testing.assert_allclose(corrected.at(3, future), wanted, atol=1e-6)
+    np.testing.assert_array_equal(corrected.at(0, np.eye(4)), paths.at(0, np.eye(4)))
+
+
+def test_objects_that_are_better_are_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The camera stays the geometric forecast's; only object motion's answer is added."""
+    noisy = stir_all(model())
+    monkeypatch.setattr(network, "choose_parts", lambda *_: {"objects": LearnedPart(True, "")})
+    made = network.forecast_frames(perception(), noisy, 4, 1, VIEWS)
+    plain = geometric.forecast_frames(perception(), 4, 1, VIEWS)
+    np.testing.assert_array_equal(made.future_from_cur[0], plain.future_from_cur[0])
+    assert not np.array_equal(made.frames[0]["source"].image, plain.frames[0]["source"].image)
 
 
 def stir_all(made: Forecaster) -> Forecaster:

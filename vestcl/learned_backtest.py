@@ -1,13 +1,14 @@
-"""Which learned parts of a network a forecast has: each must win two tests on frames already seen.
+"""Which learned parts of a network a forecast has: each must win tests on frames already seen.
 
-A test forecasts frame t from t - 1 and before, with the part and without it; no later frame is read. For a pixel p of
-t - 1 that is forecast to be at q in t, with what refinement adds there, a(q):
+A test forecasts frame t from t - h and before, with the part and without it; no later frame is read. For a pixel p of
+t - h that is forecast to be at q in t, with what refinement adds there, a(q):
 
-    e = mean min(|I_(t-1)(p) + a(q) - I_t(q)|^2, MOST)  over a grid of pixels that are in the image either way
+    e = mean min(|I_(t-h)(p) + a(q) - I_t(q)|^2, MOST)  over a grid of pixels that are in the image either way
 
-Camera first, then objects under the camera's result, then refinement under both. What wins at t is tested at t - 1 as
-well, from t - 2: one frame says little of the next. What can't be tested twice is left out. A test takes the networks
-on two frames once, of which a sequence has encoded all already, and one view.
+Camera first, then objects under the camera's result, then refinement under both, at t from t - 1. What wins there is
+tested at t - 1 from t - 2, as one frame says little of the next; and motion at t from t - 2, as it is extrapolated
+further. What can't be tested is left out. A test takes the networks on two frames once, of which a sequence has encoded
+all already, and for refinement one view.
 
 Source: SPEC section 12.
 """
@@ -24,6 +25,7 @@ from vestcl.geometric.perception import Perception
 from vestcl.learned import (
     CAMERA,
     OBJECTS,
+    PARTS,
     REFINEMENT,
     Array,
     Corrections,
@@ -36,7 +38,7 @@ from vestcl.learned import (
 )
 from vestcl.models.forecaster import Forecaster
 from vestcl.scene.correspondence import sample
-from vestcl.scene.exposure import as_exposed
+from vestcl.scene.exposure import curve_by_flow
 from vestcl.scene.motion_plane import rays_of
 from vestcl.times import is_same
 
@@ -83,27 +85,28 @@ def choose_parts(perception: Perception, model: Forecaster, index: int, known_in
     for at in (index, index - 1):
         if fault := _untestable(perception, at):
             return chosen | {part: LearnedPart(False, fault) for part in tested}
-    found = _tested(perception, model, index, tested, 1)
-    won = [part for part in tested if part in found and found[part].used]
-    again = _tested(perception, model, index - 1, won, 2) if won else {}
-    for part in won:
-        second = again.get(part, LearnedPart(False, "nothing to test at the frame before"))
-        found[part] = found[part]._replace(used=second.used, why=f"{found[part].why}; {second.why}")
+    found = _tested(perception, model, index - 1, 1, 1, tested)
+    for start, ahead, parts in ((index - 2, 1, PARTS), (index - 2, 2, (CAMERA, OBJECTS))):
+        won = [part for part in parts if part in found and found[part].used]
+        again = _tested(perception, model, start, ahead, index - start, won) if won else {}
+        for part in won:
+            other = again.get(part, LearnedPart(False, "nothing to test at the frame before"))
+            found[part] = found[part]._replace(used=other.used, why=f"{found[part].why}; {other.why}")
     return chosen | found
 
 
 def _tested(
-    perception: Perception, model: Forecaster, index: int, parts: Sequence[str], back: int
+    perception: Perception, model: Forecaster, start: int, ahead: int, back: int, parts: Sequence[str]
 ) -> dict[str, LearnedPart]:
-    """``parts`` in the forecast of frame ``index`` from the one before, made ``back`` frames before t."""
-    test, chosen = _Test.of(perception, index), dict[str, LearnedPart]()
-    path = forecast_path(perception, index - 1, 1, back)
-    camera, velocities = path.future_from_cur[0], [np.zeros_like(test.image_prev)] * 2
+    """``parts`` in the forecast from frame ``start``, ``back`` frames before t, of that ``ahead`` frames after it."""
+    test, chosen = _Test.of(perception, start, ahead), dict[str, LearnedPart]()
+    path = forecast_path(perception, start, ahead, back)
+    camera, velocities = path.future_from_cur[-1], [np.zeros_like(test.image_prev)] * 2
     if {CAMERA, OBJECTS} & set(parts):
-        found = corrections(model, given_input(perception, index - 1, model.config.prior, 1, back), 1)
+        found = corrections(model, given_input(perception, start, model.config.prior, ahead, back), ahead)
         if CAMERA in parts:
-            chosen[CAMERA] = test.verdict(test.positions(camera), test.positions(found.cameras[0]))
-            camera = found.cameras[0] if chosen[CAMERA].used else camera
+            chosen[CAMERA] = test.verdict(test.positions(camera), test.positions(found.cameras[-1]))
+            camera = found.cameras[-1] if chosen[CAMERA].used else camera
         moved = np.linalg.norm(found.velocity_cur, axis=0) > _MOVED
         if OBJECTS in parts and moved.any():
             pair = test.positions(camera), test.positions(camera, found.velocity_cur)
@@ -112,7 +115,7 @@ def _tested(
                 velocities = [found.velocity_prev, found.velocity_cur]
     if REFINEMENT in parts:
         motion = Corrections((camera,), *velocities)
-        given = given_motion(perception, index - 1, path._replace(future_from_cur=(camera,)))
+        given = given_motion(perception, start, path._replace(future_from_cur=(camera,)))
         ((added, adds),) = (shown["source"] for shown in added_by_refinement(model, given, motion, [_SOURCE], [1]))
         at = test.positions(camera, velocities[1])
         chosen[REFINEMENT] = test.verdict(at, at, added=added, adds=adds)
@@ -139,37 +142,41 @@ def _untestable(perception: Perception, index: int) -> str | None:
 
 
 class _Test(NamedTuple):
-    """Frame t, as it is forecast from t - 1."""
+    """A frame, as it is forecast from an earlier one."""
 
     name: str
     image: Array
-    """[3, H, W] at t."""
+    """[3, H, W], of the frame."""
     image_prev: Array
-    """[3, H, W] at t - 1, exposed as t is."""
+    """[3, H, W], of the earlier one, exposed as the frame is."""
     depth: Array
-    """[1, H, W] m at t - 1."""
+    """[1, H, W] m, of the earlier one."""
     velocity: Array
     """[3, H, W] m per interval."""
     counts: NDArray[np.bool_]
     """[H, W], where the recording car is not."""
     K: Matrix
+    ahead: int
+    """Intervals between the two."""
     stride: int
 
     @classmethod
-    def of(cls, perception: Perception, index: int) -> "_Test":
-        before, seen, image = perception.frame(index - 1), perception.seen(index - 1), perception.image(index)
-        image_prev = as_exposed(before.image, image, perception.correspondence(index).flow_uv)
+    def of(cls, perception: Perception, start: int, ahead: int) -> "_Test":
+        before, image_prev = perception.frame(start), perception.image(start)
+        for at in range(start + 1, start + ahead + 1):
+            pair = perception.image(at - 1), perception.image(at), perception.correspondence(at).flow_uv
+            image_prev = curve_by_flow(*pair)(image_prev)
+        image = perception.image(start + ahead)
         stride = max(1, round(math.sqrt(image[0].size / _PIXELS)))
-        known = before.depth, before.velocity, ~seen.own[0], before.K, stride
-        return cls(perception.clip[index].name, image, image_prev, *known)
+        known = before.depth, before.velocity, ~perception.seen(start).own[0], before.K, ahead, stride
+        return cls(perception.clip[start + ahead].name, image, image_prev, *known)
 
-    def positions(self, next_from_cur: Matrix, velocity: Array | None = None) -> Matrix:
-        """[2, h, w] px in t of a grid of pixels of t - 1, their velocities corrected by ``velocity`` [3, H, W]."""
+    def positions(self, future_from_cur: Matrix, velocity: Array | None = None) -> Matrix:
+        """[2, h, w] px in the frame of a grid of earlier pixels, with ``velocity`` [3, H, W] more than they had."""
         grid = np.s_[:, :: self.stride, :: self.stride]
-        points = rays_of(self.K, *self.depth.shape[1:])[grid] * self.depth[grid] + self.velocity[grid]
-        if velocity is not None:
-            points = points + velocity[grid]
-        moved = np.tensordot(next_from_cur[:3, :3], points, 1) + next_from_cur[:3, 3, None, None]
+        speed = self.velocity[grid] if velocity is None else self.velocity[grid] + velocity[grid]
+        points = rays_of(self.K, *self.depth.shape[1:])[grid] * self.depth[grid] + self.ahead * speed
+        moved = np.tensordot(future_from_cur[:3, :3], points, 1) + future_from_cur[:3, 3, None, None]
         q = np.tensordot(self.K, moved, 1)
         return np.asarray(q[:2] / np.maximum(q[2], _NEAREST), np.float64)
 
@@ -203,7 +210,8 @@ class _Test(NamedTuple):
             return LearnedPart(False, "what it changes is too small to be tested")
         before, after = (float(error[counts].mean()) for error in errors)
         psnr = [-10 * math.log10(max(error, 1e-10)) for error in (after, before)]
-        why = f"{psnr[0]:.2f} dB at frame {self.name} with it, {psnr[1]:.2f} dB without"
+        how = "" if self.ahead == 1 else f" from {self.ahead} frames before"
+        why = f"{psnr[0]:.2f} dB at frame {self.name}{how} with it, {psnr[1]:.2f} dB without"
         return LearnedPart(after < (1 - MARGIN) * before, why, *psnr)
 
     def _errors(self, at: Matrix, image: Array) -> Array:
