@@ -14,7 +14,7 @@ from test_network_input import prepared
 from torch import nn
 from train_scenes import MODELS, configured, street
 
-from train import augment
+from train import augment, card_tables
 from train.data import Draw, WindowSet, loader
 from train.fit import window_set, with_intervals
 from train.ranks import Ranks
@@ -215,3 +215,10 @@ def test_old_weights_start_a_network_of_the_new_kind(cache: Path, tmp_path: Path
         loaded = Forecaster.load(tmp_path / f"{name}.safetensors").config
         assert loaded.ego_motion is not None and (loaded.prior, loaded.ego_motion.correction) == kind
         assert (loaded.intervals_s is None) == (name == "old")
+
+
+def test_a_card_says_what_the_camera_starts_from() -> None:
+    assert card_tables._camera(SMALL) == card_tables._camera(MODELS["small-painting"]) == ""
+    learned = dataclasses.replace(BOUNDED, intervals_s=(1 / 30, 0.125))
+    wanted = " and the camera's forecast path, corrected by what a car can do in 0.0333 to 0.125 s between frames"
+    assert card_tables._camera(learned) == wanted

@@ -56,11 +56,21 @@ def about_model(weights: Weights) -> str:
     kinds = ", ".join(sorted({str(tensor.dtype).removeprefix("torch.") for tensor in weights.state.values()}))
     config = weights.config
     grid = Grid(f"Parameters, {kinds}", ("", "numbers"), (*rows, ("all", f"{weights.parameters:,}")))
+    start = _START[config.start] + _camera(config)
     words = (
-        f"`{weights.name}`, configuration `{config.name}`: motion starts from {_START[config.start]}, refinement adds "
+        f"`{weights.name}`, configuration `{config.name}`: motion starts from {start}, refinement adds "
         f"to {_BASE[config.refine.base]}. CONVENTIONS.md explains the words, `vestcl/models/config.py` has all sizes."
     )
     return f"{words}\n\n{to_markdown(grid)}".rstrip()
+
+
+def _camera(config: ModelConfig) -> str:
+    """What the camera's motion starts from, where that is the forecast path."""
+    if config.start != "prior" or config.prior != "forecast":
+        return ""
+    corrected = config.ego_motion is not None and config.ego_motion.correction == "bounded"
+    how = f", corrected by what a car can do in {config.learned_at} between frames" if corrected else ""
+    return f" and the camera's forecast path{how}"
 
 
 _START: Final = {"rest": "rest", "prior": "what was measured (the prior)"}
