@@ -156,9 +156,10 @@ def test_feedback_goes_on_as_composed_while_the_camera_turns() -> None:
             assert (got - wanted).abs().median() < 0.05, name
 
 
-def test_the_world_stands_still_in_feedback() -> None:
-    """Background has no velocity of its own in later steps, whatever objects were given in the first one."""
-    model, seen = push(Forecaster(SMALL), *(0.3,) * 6).eval(), []
+@pytest.mark.parametrize("metres", [0.0, 0.3])
+def test_all_that_moved_moves_on_in_feedback(metres: float) -> None:
+    """What the mask says is background, too: velocities are also of shadows and errors of depth. None comes of none."""
+    model, seen = push(Forecaster(SMALL), *(metres,) * 6).eval(), []
     original = model.move
 
     def move(*arguments: Any) -> Any:
@@ -168,10 +169,11 @@ def test_the_world_stands_still_in_feedback() -> None:
     model.move = move  # type: ignore[assignment, method-assign]
     with torch.no_grad():
         prior = measured(1, 32, 48, cur=(0, 0, -1))
-        model.forecast(*pair_of(1, 32, 48), camera(1, 32, 48), 2, mode="feedback", prior=prior)
-    (_, later) = seen
-    moving = later.velocity_cur.abs().amax(dim=1) > 0
-    assert 0 < moving.float().mean() < 0.1  # the block of foreground
-    assert torch.allclose(later.velocity_prev, torch.tensor(0.3), atol=1e-4)
+        steps = model.forecast(*pair_of(1, 32, 48), camera(1, 32, 48), 2, mode="feedback", prior=prior)
+    (_, later), depth = seen, steps[0].views[0].depth
+    moving = (later.velocity_cur.abs().amax(dim=1, keepdim=True) > 1e-3)[depth > 0]
+    assert moving.float().mean() == (1.0 if metres else 0.0)
+    assert torch.allclose(later.velocity_prev, torch.tensor(metres), atol=1e-4)
+    assert not later.is_corrected and torch.equal(steps[1].motion.objects.flow, steps[1].motion.start)
     for motion in later[:3]:  # forecast once and measured twice, all the same
         assert torch.allclose(motion.translation, torch.tensor([[0.0, 0, -1]]), atol=1e-5)

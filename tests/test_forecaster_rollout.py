@@ -160,6 +160,19 @@ def test_perceiving_a_forecast_frame() -> None:
         perceive_forecast(image, torch.zeros_like(depth), mask)
 
 
+def test_no_point_between_two_surfaces_comes_back_in() -> None:
+    """A splat's edge has a mean depth; the nearer surface in ratio has it. A slanted surface keeps its own."""
+    near, far = torch.full((1, 1, 12, 7), 5.0), torch.full((1, 1, 12, 7), 20.0)
+    edges = torch.tensor([8.0, 12.0]).repeat_interleave(6)[:, None].expand(1, 1, 12, 1)
+    slope = 20 * 1.02 ** torch.arange(8.0).expand(1, 1, 12, 8)
+    depth, wanted = (torch.cat([near, edge, far, slope], dim=3) for edge in (edges, edges.lt(10) * -15.0 + 20))
+    layers = perceive_forecast(torch.rand(1, 3, 12, 23), depth, torch.ones_like(depth))
+    assert torch.equal(layers.depth, wanted)
+    sky = torch.cat([far, torch.full((1, 1, 12, 1), 60.0), torch.full((1, 1, 12, 7), SKY_DEPTH)], dim=3)
+    layers = perceive_forecast(torch.rand(1, 3, 12, 15), sky, torch.ones_like(sky))
+    assert (layers.depth[..., :8] == 20).all() and (layers.depth[..., 8:] == SKY_DEPTH).all()
+
+
 def test_feedback_by_default() -> None:
     model, pair, K = stir(Forecaster(TINY)).eval(), pair_of(1, 32, 48), camera(1, 32, 48)
     with torch.no_grad():

@@ -68,9 +68,19 @@ class Step(NamedTuple):
 
 
 def next_prior(prior: MotionPrior, motion: Motion, seen: RenderedView, K: torch.Tensor) -> MotionPrior:
-    """Of the step after ``motion``, from which the source camera has ``seen`` the result."""
+    """Of the step after ``motion``, from which the source camera has ``seen`` the result.
+
+    It is the networks' own forecast and not corrected again: they learned what a measured motion lacks, and would add
+    that in every step.
+    """
     moved = (motion.objects.flow - motion.flow0)[:, 3:]
-    return repeated(prior, motion.next_from_cur, moved, seen, K, motion.later)
+    again, following = repeated(prior, motion.next_from_cur, moved, seen, K), motion.following()
+    camera, *rest = [
+        RigidMotion(*(part.detach() for part in rigid)) for rigid in (following.next_from_cur, *following.later)
+    ]
+    later = RigidMotion(*(torch.stack(parts, dim=1) for parts in zip(*rest, strict=True))) if rest else None
+    corrected = torch.zeros(len(moved), dtype=torch.bool)
+    return again._replace(next_from_cur=camera, later=later, corrected=corrected)
 
 
 def flattened(points: Sequence[torch.Tensor], flow: torch.Tensor) -> torch.Tensor:

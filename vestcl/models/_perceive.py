@@ -20,6 +20,9 @@ from vestcl.scene.layers import SKY_DEPTH, LayerBatch
 #: image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W] of 0 and 1 -> their layers.
 Perceive = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], LayerBatch]
 
+#: A pixel shows two surfaces if its depth is farther than that factor from both the nearest and the farthest around it.
+_MIXED: Final = 1.03
+
 #: From here on a forecast depth, metres, is the sky's: a turn of the camera changes its z-depth by some percent.
 _SKY_FROM: Final = SKY_DEPTH / 2
 
@@ -27,7 +30,8 @@ _SKY_FROM: Final = SKY_DEPTH / 2
 def perceive_forecast(
     image: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor, inpaint: Inpainter | None = None
 ) -> LayerBatch:
-    """The layers of forecast frames: unknown depths from the nearest pixel that has one, then inpainting.
+    """The layers of forecast frames: depths between two surfaces go to one of them, unknown ones come from the nearest
+    pixel that has one, then inpainting.
 
     Args:
         image: [B, 3, H, W] in [0, 1].
@@ -111,7 +115,8 @@ def _layers(inpaint: Inpainter | None, image: NDArray[Any], depth: NDArray[Any],
 
 
 def _filled(depth: NDArray[Any]) -> NDArray[Any]:
-    """[1, H, W] m, unknown depths from the nearest pixel that has one."""
+    """[1, H, W] m of `_unmixed`, unknown depths from the nearest pixel that has one."""
+    depth = _unmixed(depth)
     known = depth[0] > 0
     if not known.any():
         raise ValueError("`depth` must be known (above 0 m) somewhere: no point of the forecast is in the picture")
@@ -121,3 +126,15 @@ def _filled(depth: NDArray[Any]) -> NDArray[Any]:
     at = np.zeros(nearest.max() + 1, np.intp)
     at[nearest[known]] = known.ravel().nonzero()[0]
     return np.asarray(depth.ravel()[at[nearest]][None])
+
+
+def _unmixed(depth: NDArray[Any]) -> NDArray[Any]:
+    """[1, H, W] m where pixels that show two surfaces, at edges, have the depth of the one that is nearer in ratio.
+
+    Their splatted depth is a mean, at which nothing is: points there would leave both surfaces, farther in every step.
+    """
+    known, brush = depth[0] > 0, np.ones((3, 3), np.uint8)
+    near = cv2.erode(np.where(known, depth[0], depth[0].max()), brush)
+    far = cv2.dilate(depth[0], brush)
+    mixed = known & (depth[0] > _MIXED * near) & (_MIXED * depth[0] < far)
+    return np.where(mixed, np.where(depth[0] ** 2 < near * far, near, far), depth[0])[None]

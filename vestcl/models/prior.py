@@ -7,10 +7,9 @@ import torch
 
 from vestcl import geometry
 from vestcl.models._clouds import as_image, as_points
-from vestcl.models._frames import FOREGROUND_BELOW
 from vestcl.models._layers import check
 from vestcl.models._render import RenderedView
-from vestcl.models.camera_correction import MEASURED, RATES, CameraPrior, rates_of
+from vestcl.models.camera_correction import MEASURED, RATES, CameraPrior
 from vestcl.models.rigid_motion import RigidMotion
 from vestcl.ops.unproject import unproject
 
@@ -33,8 +32,7 @@ class MotionPrior(NamedTuple):
     """[B] from t - 1 to t + 1; None is 2, of evenly spaced frames. From t to t + 1 it is 1."""
     corrected: torch.Tensor | None = None
     """[B] bool, whether the networks correct it; None is True. They know the interval that they learned at: where any
-    image has another one, motion is the prior's for all."""
-
+    image has another one, motion is the prior's for all. A forecast motion is not corrected again."""
     later: RigidMotion | None = None
     """[B, n, 4] and [B, n, 3]: the camera's of the n intervals after t + 1, extrapolated; then the last one that is
     known repeats."""
@@ -117,14 +115,12 @@ def repeated(
     moved: torch.Tensor,
     seen: RenderedView,
     K: torch.Tensor,
-    later: Sequence[RigidMotion] = (),
 ) -> MotionPrior:
     """The prior of the step after: the camera's motion G once more, and what moved next to it as it did.
 
-    A prior that has the motion of later intervals is followed by ``later``, as it was corrected.
-
-    What is seen at x came m over the interval, so beside the camera by s = x - G (x - m), if it is foreground. The
-    frame before has R^-1 of what its pixels moved beside the rigid flow.
+    What is seen at x came m over the interval, so beside the camera by s = x - G (x - m), whatever the mask says of it:
+    shadows and errors of depth have velocities, too. The frame before has R^-1 of what its pixels moved beside the
+    rigid flow.
 
     Args:
         prior: of the step that is done.
@@ -132,33 +128,18 @@ def repeated(
         moved: [B, 3, H, W] m, of its current frame's pixels beside the rigid flow, in the next camera's axes.
         seen: its view from the source camera.
         K: [B, 3, 3] px.
-        later: the camera's motion of the intervals after, as they were forecast with G.
 
     Returns:
         The prior; no gradient.
     """
     height, width = seen.depth.shape[2:]
-    once = _detached(next_from_cur)
+    once = RigidMotion(*(part.detach() for part in next_from_cur))
     rigid = geometry.compose_rigid(*once)
     points = unproject(seen.depth.detach(), K)
     before = geometry.transform_points(rigid, points - as_points(seen.motion_xyz))
     velocity = as_image(points - before, height, width)
-    known = (seen.depth > 0) & (seen.background < FOREGROUND_BELOW)
     velocity_prev = torch.einsum("bji,bjhw->bihw", rigid[:, :3, :3], moved.detach())
-    velocity_cur = torch.where(known, velocity, 0)
-    follows = prior.camera.intervals > 1 and len(later) > 0
-    cameras = [_detached(one) for one in later] if follows else [once]
-    rest = None
-    if len(cameras) > 1:
-        rest = RigidMotion(*(torch.stack(parts, dim=1) for parts in zip(*cameras[1:], strict=True)))
-    camera = prior.camera
-    latest = rates_of([once], camera.dt)[:, -1:]
-    measured = None if prior.measured is None else torch.cat([prior.measured[:, 1:], latest], dim=1)
+    velocity_cur = torch.where(seen.depth > 0, velocity, 0)
     return MotionPrior(
-        cameras[0], once, prior.cur_from_prev, velocity_prev, velocity_cur,
-        corrected=prior.corrected, later=rest, measured=measured, seconds=prior.seconds,
-    )  # fmt: skip
-
-
-def _detached(motion: RigidMotion) -> RigidMotion:
-    return RigidMotion(*(part.detach() for part in motion))
+        once, once, prior.cur_from_prev, velocity_prev, velocity_cur, corrected=prior.corrected, seconds=prior.seconds
+    )
