@@ -1,5 +1,6 @@
 """What can be known of a clip's frames without a network: depth, own motion, masks, layers, things. Kept by frame."""
 
+import dataclasses
 import logging
 import math
 import threading
@@ -28,6 +29,7 @@ from vestcl.scene.motion import backtest
 from vestcl.scene.motion.outline import whole_objects
 from vestcl.scene.motion_depth import MotionDepth, motion_depth
 from vestcl.scene.motion_mask import motion_mask, rigid_pixels
+from vestcl.scene.own_car import own_car
 from vestcl.scene.parallax import View, refine_depth
 from vestcl.scene.sky import sky_mask
 from vestcl.scene.stereo import stereo_depth
@@ -44,6 +46,9 @@ _DENSE: Final = 0.3
 #: From so many intervals on there is a gap between two frames. It is too long if flow is believed (its error forth and
 #: back, px) at less than that share of the pixels that it is believed at between the two frames before.
 _GAP, _BELIEVED, _LOST = 1.5, 1.0, 0.6
+
+#: A bonnet is looked for in so many last images, and is no farther than that, metres: the road never covers it.
+_COMPARED, _BONNET = 4, 1.5
 
 #: Results of so many frames before the last one asked for are kept; a forecast looks at three.
 _KEPT: Final = 4
@@ -130,6 +135,15 @@ class Perception:
             return False
         now, before = ((self.correspondence(i).error < _BELIEVED).mean() for i in (index, index - 1))
         return bool(now < _LOST * before)
+
+    def own(self, index: int) -> NDArray[np.bool_]:
+        """[1, H, W], True where the recording car itself is in the image: by the clip's own files, else as found."""
+        sample = self.clip[index]
+        if sample.ego_vehicle is not None:
+            return sample.read_ego_vehicle().copy()
+        since = range(index, max(index - _COMPARED, -1), -1)
+        lost = next((i for i in since if self.is_lost(i)), 0)
+        return self.once("own car", index, lambda: own_car([self.image(i) for i in since if i >= lost]))
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """M [1, H, W], True = static background."""
@@ -238,7 +252,7 @@ class Perception:
     def _combine(self, index: int) -> CombinedDepth:
         sample, estimate = self.clip[index], self._given_depth(index)
         assert estimate is not None and isinstance(sample.depth, EstimatedFrame)
-        static = ~sample.read_ego_vehicle()
+        static = ~self.own(index)
         if sample.labels is not None:
             static &= sample.read_mask()
         if len(self.clip) == 1 or self.is_lost(index):
@@ -273,7 +287,7 @@ class Perception:
         if self.is_monocular(index):
             return self._from_motion(index).prev_from_cur
         sample = self.clip[index]
-        static = ~sample.read_ego_vehicle()
+        static = ~self.own(index)
         if self.has_labels:
             static &= sample.read_mask()
         found = ego_motion(self.raw_depth(index), static, self.correspondence(index), sample.K)
@@ -291,7 +305,7 @@ class Perception:
             rigid = rigid_pixels(self.raw_depth(index), sample.K, self.prev_from_cur(index))
             pair = self.image(index), self.image(index - 1), self.correspondence(index)
             mask = ~whole_objects(~mask[0], *pair, rigid)[None]
-        return mask | sample.read_ego_vehicle() | self._sky(index, self.raw_depth(index))
+        return mask | self.own(index) | self._sky(index, self.raw_depth(index))
 
     def _sky(self, index: int, depth: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:
         sample = self.clip[index]
@@ -299,11 +313,14 @@ class Perception:
 
     def _see(self, index: int) -> Seen:
         sample, mask, depth = self.clip[index], self.mask(index), self.raw_depth(index)
-        own = sample.read_ego_vehicle().copy()
+        own = self.own(index)
         if index > 0 and not self.is_monocular(index):
             view = View(self.correspondence(index), self.prev_from_cur(index))
             depth = refine_depth(depth, self.inverse_std(index), sample.K, [view], mask & ~own)
         layers = build_layers(self.image(index), depth, mask, sky=self._sky(index, depth), inpaint=self.inpaint)
+        if sample.ego_vehicle is None and own.any():
+            near = (np.where(own, of.clip(max=_BONNET), of) for of in (layers.depth, layers.background_depth))
+            layers = dataclasses.replace(layers, **dict(zip(("depth", "background_depth"), near, strict=True)))
         things = objects.segment(mask, layers.depth)
         velocity = np.zeros_like(layers.image)
         if index > 0:
