@@ -5,7 +5,9 @@ import pytest
 from data_files import real
 from numpy.typing import NDArray
 
+from vestcl.data.open import open_sequence
 from vestcl.data.street import Street, intrinsics
+from vestcl.geometric import Perception
 from vestcl.io import read_image
 from vestcl.io.depth import read_depth
 from vestcl.io.labels import SKY, read_train_ids
@@ -52,6 +54,49 @@ def test_sky_with_depths_far_away_is_sky() -> None:
     image, truth = horizon()
     depth = np.where(truth, np.float32(400), np.float32(12))
     assert overlap(sky_mask(image, depth), truth) > 0.9
+
+
+def matched(left: float, right: float) -> NDArray[np.float32]:
+    """[1, H, W] m, as a stereo pair fills an even region: from one rim's depth to the other's."""
+    return np.broadcast_to(np.geomspace(left, right, WIDTH, dtype=np.float32), (1, HEIGHT, WIDTH)).copy()
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "is_sky"), [(12, 90, True), (14, 18, False), (6, 9, False), (6, 24, False), (150, 180, True)]
+)
+def test_the_sky_of_a_stereo_pair_has_no_surface(left: float, right: float, is_sky: bool) -> None:
+    """A white wall or a lorry has one depth, and a lorry is near; far is far."""
+    image, truth = horizon()
+    found = sky_mask(image, matched(left, right), matched=True)
+    assert overlap(found, truth) > 0.9 if is_sky else not found.any()
+    assert not sky_mask(image, matched(left, right)).any() or left > 80
+
+
+def test_the_sky_of_a_stereo_pair_is_above_the_road() -> None:
+    """A white wall at the side is none beside the sky, nor without it, however its matched depths vary."""
+    image, truth = horizon()
+    wall = np.s_[:, :25, 130:]
+    image[wall] = 1.0
+    image[:, :25, 128:130], truth[:, :, 128:] = 0.05, False
+    depth = matched(12, 90)
+    depth[wall] = np.linspace(8, 44, WIDTH - 130, dtype=np.float32)
+    assert overlap(sky_mask(image, depth, matched=True), truth) > 0.9
+    image[:, :25, :128] = np.random.default_rng(0).random((3, 25, 128)) * 0.3
+    assert not sky_mask(image, depth, matched=True).any()
+
+
+def test_without_any_match_the_sky_is_found_as_before() -> None:
+    image, truth = horizon()
+    for depth in (None, np.zeros((1, HEIGHT, WIDTH), np.float32)):
+        assert overlap(sky_mask(image, depth, matched=True), truth) > 0.9
+
+
+@pytest.mark.parametrize(("name", "index"), [("kitti_odometry", 15), ("kitti_odometry_00", 45)])
+def test_kitti_stereo_spares_white_walls(name: str, index: int) -> None:
+    """Both images have white walls that touch the upper border, brighter than the sky."""
+    perception = Perception(open_sequence(real(name)))
+    found, image = perception._sky(index, perception.raw_depth(index))[0], perception.image(index)[0]
+    assert 0.04 < found.mean() < 0.13 and not (found & (image > 0.97)).any() and not found[200:].any()
 
 
 def test_nothing_below_where_a_car_looks() -> None:

@@ -309,7 +309,11 @@ class Perception:
 
     def _sky(self, index: int, depth: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:
         sample = self.clip[index]
-        return sample.read_labels() == SKY if self.has_labels else sky_mask(self.image(index), depth)
+        if self.has_labels:
+            return sample.read_labels() == SKY
+        if depth is not None and sample.right is not None and self._given_depth(index) is None:
+            return sky_mask(self.image(index), self.raw_depth(index), matched=True)
+        return sky_mask(self.image(index), depth)
 
     def _see(self, index: int) -> Seen:
         sample, mask, depth = self.clip[index], self.mask(index), self.raw_depth(index)

@@ -25,6 +25,12 @@ _LOWEST: Final = 0.6
 #: to 0.19 on KITTI odometry, where white walls have 0.7. Its rim, px, does not count: things before it widen there.
 _NEAR, _KNOWN_SHARE, _RIM = 80.0, 0.35, 7
 
+#: A stereo pair matches the even sky with whatever is around it: from the 10th to the 90th percentile its depths are a
+#: factor of 2.5 to 7 apart on KITTI odometry, those of white walls 1.02 to 1.4, and some are far, metres. The first
+#: region is above the road: it reaches that part of the width. Others are as bright to that, and as uneven or as far.
+_SPREAD, _AS_SPREAD, _FAR, _AS_FAR = 2.2, 1.8, 40.0, 30.0
+_MIDDLE, _AS_BRIGHT = (0.4, 0.6), 0.06
+
 #: The sky is of one brightness: regions that differ by more from the first are something else. The first is the one
 #: with the most light, area times brightness: shaded walls may be larger than a narrow sky, white ones are brighter.
 #: On the street 0.1 takes half the walls for sky that 0.2 takes.
@@ -38,7 +44,7 @@ _SAME, _ENCLOSED_KNOWN = 0.05, 0.02
 _SMALLEST, _SMALLEST_ENCLOSED = 0.001, 0.0002
 
 
-def sky_mask(image: ArrayLike, depth: ArrayLike | None = None) -> NDArray[np.bool_]:
+def sky_mask(image: ArrayLike, depth: ArrayLike | None = None, *, matched: bool = False) -> NDArray[np.bool_]:
     """True in the sky: regions of a small gradient and enough light that touch the upper border and have no near depth.
 
     With ``depth`` also regions that don't touch it, if they are as bright as the sky and no depth is known in them.
@@ -46,6 +52,7 @@ def sky_mask(image: ArrayLike, depth: ArrayLike | None = None) -> NDArray[np.boo
     Args:
         image: [3, H, W] RGB in [0, 1].
         depth: [1, H, W] m, 0 = invalid; bright walls are told from the sky by it.
+        matched: ``depth`` is matched in a stereo pair, which has depths in the sky, too, but not those of one surface.
 
     Returns:
         [1, H, W].
@@ -62,7 +69,10 @@ def sky_mask(image: ArrayLike, depth: ArrayLike | None = None) -> NDArray[np.boo
     candidate = (slope < _SMOOTH) & (grey > _BRIGHT * np.quantile(grey, 0.9))
     candidate &= _cold(image)
     candidate[round(_LOWEST * len(candidate)) :] = False
-    sky = _alike(_regions(candidate, metres), grey)
+    if matched and metres.any():
+        sky = _of_no_surface(candidate, metres, grey)
+    else:
+        sky = _alike(_regions(candidate, metres), grey)
     if sky.any() and metres.any():
         sky |= _enclosed(candidate, metres, grey, float(np.median(grey[sky])))
     return _closed(sky, grey, slope)[None]
@@ -102,6 +112,32 @@ def _regions(candidate: NDArray[np.bool_], metres: NDArray[np.float32]) -> NDArr
     keep &= np.isin(np.arange(count), labels[:2])
     keep[0] = False
     return np.where(keep[labels], labels, 0)
+
+
+def _of_no_surface(
+    candidate: NDArray[np.bool_], metres: NDArray[np.float32], grey: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """[H, W], True in regions at the upper border whose matched depths are not those of one surface."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(candidate.astype(np.uint8), connectivity=4)
+    at_border = np.unique(labels[:2])
+    large = [n for n in at_border[at_border > 0] if stats[n, cv2.CC_STAT_AREA] >= _SMALLEST * candidate.size]
+    middle = slice(*(round(share * candidate.shape[1]) for share in _MIDDLE))
+    depths = {n: metres[(labels == n) & (metres > 0)] for n in large}
+    spread = {n: np.quantile(z, (0.1, 0.5, 0.9)) if len(z) else np.full(3, np.inf) for n, z in depths.items()}
+    first = [
+        n
+        for n, (low, median, high) in spread.items()
+        if (median >= _NEAR or (high >= _SPREAD * low and high >= _FAR)) and (labels[:, middle] == n).any()
+    ]
+    if not first:
+        return np.zeros_like(candidate)
+    brightness = {n: float(np.median(grey[labels == n])) for n in large}
+    known = brightness[max(first, key=lambda n: int(stats[n, cv2.CC_STAT_AREA]))]
+    keep = np.zeros(count, bool)
+    for n, (low, median, high) in spread.items():
+        uneven = high >= _AS_SPREAD * low or median >= _AS_FAR
+        keep[n] = abs(brightness[n] - known) < _AS_BRIGHT and uneven
+    return np.asarray(keep[labels])
 
 
 def _alike(regions: NDArray[np.int32], grey: NDArray[np.float32]) -> NDArray[np.bool_]:
