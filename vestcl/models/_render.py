@@ -119,9 +119,9 @@ def splat_cloud(
 ) -> Side:
     """Show a cloud in ``camera``: opaque points of radius r = rho z_src / z_tgt f_tgt / f_src, clamped to RADIUS.
 
-    With ``config.stretched`` r grows with the distance to what was beside a point, and points that nothing is beside
-    any more are left out: see `_surface`. So are points that come so near that r would be beyond RADIUS before: a ball
-    of that size hides what it is not.
+    Points that come so near that rho z_src / z_tgt is beyond RADIUS are left out, as `vestcl.geometric.render` leaves
+    them out: a ball of that size hides what it is not. A longer focal length leaves out none. With ``config.stretched`` r grows with the distance to what was beside a
+    point, up to RADIUS, and points that nothing is beside any more are left out, too: see `_surface`.
 
     Args:
         cloud: of B images.
@@ -144,11 +144,11 @@ def splat_cloud(
     near = z.clamp(min=constants.NEAR)
     zoom = (camera.K[:, 0, 0] * camera.K[:, 1, 1] / (K[:, 0, 0] * K[:, 1, 1])).sqrt()
     zoom_of_point = zoom.repeat_interleave(cloud.starts.diff())
-    magnified, opacities = zoom_of_point * cloud.depth / near, torch.ones_like(z)
+    magnified = zoom_of_point * cloud.depth / near
+    opacities = (config.rho * (cloud.depth / near).detach() <= RADIUS[1]).to(z)
     if config.stretched:
-        factor, opacities = _surface(points_uv.detach(), magnified.detach(), cloud.grids)
-        opacities = opacities * (config.rho * magnified.detach() <= RADIUS[1])
-        magnified = magnified * factor
+        factor, whole = _surface(points_uv.detach(), magnified.detach(), cloud.grids)
+        opacities, magnified = opacities * whole, magnified * factor
     radii = (config.rho * magnified).clamp(*RADIUS)
     order = z.detach()
     if config.inpainted != "own":

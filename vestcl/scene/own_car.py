@@ -1,5 +1,6 @@
 """The recording car's own bonnet: what at the lower border stays where it is in the image while the road moves."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Final
 
@@ -54,7 +55,7 @@ def own_car(images: Sequence[NDArray[np.float32]]) -> NDArray[np.bool_]:
     planes = [_grey(image, size) for image in images]
     down = cv2.Sobel(planes[0], cv2.CV_32F, 0, 1, scale=1 / 8)
     right = cv2.Sobel(planes[0], cv2.CV_32F, 1, 0, scale=1 / 8)
-    changed = np.max([np.abs(one - other) for one, other in zip(planes, planes[1:], strict=False)], axis=0)
+    changed = np.max([np.abs(one - other) for one, other in itertools.pairwise(planes)], axis=0)
     edge = (np.abs(down) > _EDGE) & (np.abs(down) > np.abs(right))
     static = edge & (changed < _STATIC * np.abs(down))
     rim = _rim(static, round((1 - _LOWER) * size[1]))
