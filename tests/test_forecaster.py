@@ -288,6 +288,6 @@ def test_a_longer_focal_length_leaves_out_no_point() -> None:
     K = camera(1, 9, 9)
     points, size = torch.tensor([[0.0, 0, 10]]), torch.tensor([10.0])
     cloud = Cloud(points, 0 * points, 0 * points, size, one, torch.ones(1, 3), one, torch.zeros(1).bool(), (), starts)
-    longer = K * torch.tensor([10.0, 10.0, 1.0])[:, None]
+    longer = K * torch.tensor([[10.0, 10, 1]] * 2 + [[1, 1, 1]])
     side = splat_cloud(cloud, Camera(still, longer), K, still, RenderConfig(rho=1.0), 9, 9)
     assert float(side.coverage[0, 0, 4, 4]) > 0.8

@@ -26,6 +26,7 @@ from vestcl.scene.inpainters import Inpainter, inpainter
 from vestcl.scene.layers import Layers, build_layers
 from vestcl.scene.lidar import densify
 from vestcl.scene.motion import backtest
+from vestcl.scene.motion.observable import on_the_road
 from vestcl.scene.motion.outline import whole_objects
 from vestcl.scene.motion_depth import MotionDepth, motion_depth
 from vestcl.scene.motion_mask import motion_mask, rigid_pixels
@@ -159,8 +160,13 @@ class Perception:
         asked = image, seen.layers.depth, seen.velocity
         if index == 0:
             return backtest.Frame(*asked, np.zeros_like(image[:2]), np.eye(4), K)
-        motion = self.correspondence(index).flow_uv, self.prev_from_cur(index)
+        motion = self._flow(index, seen.layers).flow_uv, self.prev_from_cur(index)
         return backtest.Frame(*asked, *motion, K, self.clip.elapsed(index))
+
+    def _flow(self, index: int, layers: Layers) -> Correspondence:
+        """From frame ``index`` to the one before; on the road only what the image can show."""
+        found, motion = self.correspondence(index), (self.prev_from_cur(index), self.clip[index].K)
+        return found._replace(flow_uv=on_the_road(found.flow_uv, layers.image, layers.depth, layers.mask, *motion))
 
     def inverse_std(self, index: int) -> float:
         """Standard deviation of 1 / depth, 1/m."""
@@ -337,7 +343,8 @@ class Perception:
             pair = Pair(layers.image, self.image(index - 1), self.prev_from_cur(index), sample.K)
             by_thing = search(things, objects.velocities(things, *measured, *motion), self.raw_depth(index), pair)
             velocity = by_thing.astype(np.float32)[things].transpose(2, 0, 1)
-            by_flow = objects.follow_flow(velocity, layers.image, layers.depth, *motion)
+            followed = self._flow(index, layers), *motion[1:]
+            by_flow = objects.follow_flow(velocity, layers.image, layers.depth, *followed)
             velocity = confirmed(by_flow, velocity, layers.depth, pair)
             velocity /= np.float32(self.clip.elapsed(index))
         return Seen(layers, things, velocity, own)

@@ -54,7 +54,7 @@ def motion_mask(
     off = np.hypot(*(moved_pixels(correspondence.flow_uv) - rigid))
     believed = (depth[0] > 0) & (correspondence.error[0] < _FLOW_ERROR)
     moves = believed & (off > _MOVES + _MOVES_SHARE * still)
-    return ~_regions(moves, _lies_flat(depth[0], K))[None]
+    return ~_regions(moves, lies_flat(depth[0], K))[None]
 
 
 def rigid_pixels(
@@ -67,7 +67,7 @@ def rigid_pixels(
     return q[:2] / np.maximum(q[2], 1e-6)
 
 
-def _lies_flat(depth: NDArray[np.float32], K: NDArray[np.float64]) -> NDArray[np.bool_]:
+def lies_flat(depth: NDArray[np.float32], K: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Where the surface [H, W] is horizontal: of a plane n . x = 1, 1/z = n . K^-1 p, the gradient of 1/z tells n."""
     inverse = cv2.blur(np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0), (5, 5))
     right, down = cv2.Sobel(inverse, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(inverse, cv2.CV_32F, 0, 1, scale=1 / 8)
