@@ -138,13 +138,18 @@ class Perception:
         return bool(now < _LOST * before)
 
     def own(self, index: int) -> NDArray[np.bool_]:
-        """[1, H, W], True where the recording car itself is in the image: by the clip's own files, else as found."""
-        sample = self.clip[index]
-        if sample.ego_vehicle is not None:
-            return sample.read_ego_vehicle().copy()
-        since = range(index, max(index - _COMPARED, -1), -1)
-        lost = next((i for i in since if self.is_lost(i)), 0)
-        return self.once("own car", index, lambda: own_car([self.image(i) for i in since if i >= lost]))
+        """[1, H, W], True where the recording car itself is in the image: by the clip's own files; found in a video of
+        one camera, which may be a dashboard's."""
+        key, sample = ("own car", index), self.clip[index]
+        with self._lock:
+            if key not in self._kept:
+                if sample.ego_vehicle is not None or not self.is_monocular(index):
+                    self._kept[key] = sample.read_ego_vehicle().copy()
+                else:
+                    since = range(index, max(index - _COMPARED, -1), -1)
+                    first = next((i for i in since if self.is_lost(i)), 0)
+                    self._kept[key] = own_car([self.image(i) for i in since if i >= first])
+            return self._kept[key]
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """M [1, H, W], True = static background."""

@@ -51,7 +51,7 @@ def on_the_road(
     dst_from_src: NDArray[np.float64],
     K: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """``flow_uv`` where surfaces are not level; on those the flow f of the camera's motion, and `observable` of the rest.
+    """``flow_uv``; on what is level the flow f of the camera's motion, and `observable` of what is beyond it.
 
     Lane markings and asphalt then stay part of the road: what flow shows of them beyond f is a guess. Shadows have
     edges, and what stands on the road is not level.
