@@ -2,13 +2,16 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from vestcl.bench import _open_pixels as open_pixels
 from vestcl.bench import inpaint
 from vestcl.bench.inpaint import InpaintBench, main, score
 from vestcl.cli import main as command
+from vestcl.data import Street
 
 
 def test_score_of_a_known_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,3 +45,23 @@ def test_an_unknown_method_is_told(capsys: pytest.CaptureFixture[str]) -> None:
         command(["bench", "inpaint", "--streets", "1", "--height", "64", "--width", "208", "--methods", "magic"]) == 2
     )
     assert "`method` must be one of" in capsys.readouterr().err
+
+
+def test_open_pixels_of_a_street() -> None:
+    """Scores of every step, camera and number of frames; more memory covers no fewer of the open pixels."""
+    clip = Street.generate(4).clip(10, 48, 160)
+    assert open_pixels.windows_of(clip, 1, (0, 2)) == [3]
+    scores = list(open_pixels.measure(clip, [3], (0, 2), None))
+    assert [(one.step, one.memory) for one in scores if one.view == "source"] == [
+        (step, count) for step in open_pixels.STEPS for count in (0, 2)
+    ]
+    assert all(one.filled == 0 for one in scores if one.memory == 0) and any(one.filled > 0 for one in scores)
+    assert open_pixels.table_of(scores, "street").row_count == 2
+    with pytest.raises(ValueError, match="must have 9 frames or more, got 8"):
+        open_pixels.windows_of(clip[:8], 1, (0, 2))
+
+
+@pytest.mark.parametrize(("option", "words"), [({"windows": 0}, "`windows`"), ({"memory": (-1,)}, "`memory`")])
+def test_numbers_of_clips_out_of_range(option: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=f"{words} must be"):
+        InpaintBench(**option)

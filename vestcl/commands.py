@@ -165,6 +165,9 @@ class Forecast:
     inpaint: str | None = None
     """How the background behind the foreground is filled: regions, telea ..., or lama:FILE, LaMa's TorchScript export.
     Without it: regions."""
+    memory: int | None = None
+    """Frames before t-1 whose static scene is shown where frames t and t-1 leave something open; 0 shows none. Of the
+    geometric forecast only. Without it: 3."""
     rig: str | None = None
     """KITTI: colour or grey cameras."""
     accumulated_depth: bool = False

@@ -104,6 +104,13 @@ def is_network_file(name: str, value: str) -> bool:
     return True
 
 
+def _check_remembered(options: "cli.Forecast") -> None:
+    if options.memory is not None and options.memory < 0:
+        raise ValueError(f"`memory` must be 0 frames or more, got {options.memory}")
+    if options.memory is not None and options.model is not None:
+        raise ValueError("`memory` is of the geometric forecast: it can't be combined with `model`")
+
+
 def check(options: "cli.Forecast") -> None:
     """Refuse options that need others.
 
@@ -111,6 +118,7 @@ def check(options: "cli.Forecast") -> None:
         ValueError: the message names both.
     """
     check_file_options(options)
+    _check_remembered(options)
     for name in ("squeeze", "st_lpips"):
         if getattr(options, name) is not None and not options.compare:
             raise ValueError(f"`{name}` is a distance to the truth; it needs `compare`")

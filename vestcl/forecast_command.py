@@ -263,6 +263,7 @@ def _forecast(
     if model is None or later is None:
         from vestcl import geometric
 
+        how |= {} if options.memory is None else {"memory": options.memory}
         return geometric.forecast_clip(*asked, progress=stages.show, **how)
     from vestcl import network
 

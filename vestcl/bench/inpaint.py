@@ -1,7 +1,10 @@
-"""`vestcl bench inpaint`: what each method makes of the background, against the street without its foreground."""
+"""`vestcl bench inpaint`: what each method makes of the background, against the street without its foreground.
+
+With clips: what forecasts show where no pixel of frames t and t-1 is, with and without a memory.
+"""
 
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,13 +16,17 @@ from rich.progress import track
 from rich.table import Table
 
 from vestcl import runtime
+from vestcl.bench import _open_pixels as open_pixels
 from vestcl.bench._results import describe, write_json
 from vestcl.data import Street, intrinsics
+from vestcl.data.open import open_sequence
 from vestcl.data.raycast import SKY_DEPTH as STREET_SKY
 from vestcl.io.labels import background
+from vestcl.perceptual import StLpips
 from vestcl.scene.inpaint import DEFAULT, inpaint_background
 from vestcl.scene.inpainters import METHODS
 from vestcl.scene.layers import SKY_DEPTH
+from vestcl.st_lpips import Option as StLpipsOption
 
 #: Seeds of the streets, which nothing is trained on.
 FIRST_SEED: Final = 2000
@@ -42,14 +49,26 @@ class InpaintBench:
     """Pixels."""
     methods: tuple[str, ...] = tuple(METHODS)
     """Names, or lama:PATH."""
+    clips: tuple[str, ...] = ()
+    """Forecast these clips instead, at the size above, and score the pixels that frames t and t-1 leave open."""
+    memory: tuple[int, ...] = (0, 2, 3, 5, 10)
+    """Numbers of remembered frames to compare on clips."""
+    windows: int = 6
+    """Windows of each clip, spread over it."""
+    st_lpips: StLpipsOption = None
+    """Measure ST-LPIPS on clips, by the weights FILE or those inside an installed stlpips-pytorch."""
     device: str | None = None
-    """OpenCL device that renders the streets."""
+    """OpenCL device that renders."""
     json: Path | None = None
     """File for the figures."""
 
     def __post_init__(self) -> None:
         if self.streets < 1:
             raise ValueError(f"`streets` must be 1 or more, got {self.streets}")
+        if self.windows < 1:
+            raise ValueError(f"`windows` must be 1 or more, got {self.windows}")
+        if not self.memory or min(self.memory) < 0:
+            raise ValueError(f"`memory` must be one or more numbers of frames, 0 or more each, got {self.memory}")
 
 
 def main(config: InpaintBench) -> None:
@@ -57,6 +76,9 @@ def main(config: InpaintBench) -> None:
     console = Console()
     with runtime.use(config.device):
         about = describe(runtime.current())
+        if config.clips:
+            _measure_clips(config, about, console)
+            return
         scores: dict[str, list[Scores]] = {method: [] for method in config.methods}
         for seed in track(range(FIRST_SEED, FIRST_SEED + config.streets), "streets", console=console, transient=True):
             frame = street(seed, config.height, config.width)
@@ -66,6 +88,19 @@ def main(config: InpaintBench) -> None:
     console.print(_table(means, config))
     if config.json is not None:
         write_json(config.json, {"about": about, "streets": config.streets, "means": means, "scores": scores})
+
+
+def _measure_clips(config: InpaintBench, about: dict[str, str], console: Console) -> None:
+    distance = None if config.st_lpips is None else StLpips.load(config.st_lpips)
+    scores: list[open_pixels.OpenScore] = []
+    for name in config.clips:
+        clip = open_sequence(name).resized(config.height, config.width)
+        indices = open_pixels.windows_of(clip, config.windows, config.memory)
+        found = list(open_pixels.measure(clip, indices, config.memory, distance))
+        console.print(open_pixels.table_of(found, f"{clip.name}, {len(indices)} windows"))
+        scores += found
+    if config.json is not None:
+        write_json(config.json, {"about": about, "scores": [asdict(one) for one in scores]})
 
 
 def street(seed: int, height: int, width: int) -> tuple[NDArray[Any], ...]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
+from vestcl.geometric.memory import MEMORY, Memory, remember
 from vestcl.geometric.paths import Paths, forecast_cameras, point_paths
 from vestcl.geometric.perception import Perception
 from vestcl.geometric.render import Cloud, Shown, holes, rendered, show
@@ -21,6 +22,10 @@ from vestcl.scene.inpainters import Inpainter
 
 #: The name of this method in tables and files.
 METHOD: Final = "geometric"
+
+#: The source camera looks along the road, whose vanishing point a view shows unless it is turned away from it: by 60
+#: degrees.
+_AHEAD: Final = 0.5
 
 Progress = Callable[[str, float], None]
 
@@ -32,6 +37,7 @@ def forecast_clip(
     views: Sequence[View],
     *,
     inpaint: Inpainter | None = None,
+    memory: int = MEMORY,
     progress: Progress | None = None,
 ) -> Forecast:
     """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` alone.
@@ -42,6 +48,7 @@ def forecast_clip(
         steps: frames to forecast, 1 or more.
         views: cameras to show each from.
         inpaint: how the background behind the foreground is filled, see `Perception`.
+        memory: see `forecast_frames`.
         progress: called with the stage and the share of the work that is done.
 
     Returns:
@@ -50,19 +57,19 @@ def forecast_clip(
     Raises:
         ValueError: no such frame or none before it, no steps, no views, or a clip that depth can't be had for.
     """
-    done, total = [0.0], _stages(index) + steps * len(views)
+    done, total = [0.0], _stages(index, memory) + steps * len(views)
 
     def tell(stage: str) -> None:
         if progress:
             progress(stage, min(done[0] / total, 1.0))
         done[0] += 1
 
-    return forecast_frames(Perception(clip, tell, inpaint=inpaint), index, steps, views, tell=tell)
+    return forecast_frames(Perception(clip, tell, inpaint=inpaint), index, steps, views, memory=memory, tell=tell)
 
 
-def _stages(index: int) -> int:
+def _stages(index: int, memory: int) -> int:
     """Results that a forecast asks `Perception` for: six of each frame, and the picture before them."""
-    return 6 * min(index + 1, 2) + 1
+    return 6 * min(index + 1, 2 + max(memory, 0)) + 1
 
 
 def forecast_frames(
@@ -73,6 +80,7 @@ def forecast_frames(
     *,
     future_from_cur: Sequence[NDArray[np.float64]] | None = None,
     paths: Paths | None = None,
+    memory: int = MEMORY,
     tell: Callable[[str], None] = lambda stage: None,
 ) -> Forecast:
     """`forecast_clip` on a `Perception` that may have seen earlier frames already, and keeps what it sees.
@@ -84,6 +92,7 @@ def forecast_frames(
         views: cameras to show each from.
         future_from_cur: [4, 4] m per step, the camera's motion from t, in place of the forecast one.
         paths: of the points of frame t; None is `point_paths`.
+        memory: frames before t-1 whose static scene is shown where t and t-1 leave something open, 0 or more.
         tell: called with the stage before each view.
 
     Raises:
@@ -94,11 +103,11 @@ def forecast_frames(
         raise ValueError(f"`index` must be 1 ... {len(clip) - 1}, a frame of {clip.name} with one before, got {index}")
     if steps < 1 or not views:
         raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
-    ahead = range(1, steps + 1)
+    ahead, remembered = range(1, steps + 1), remember(perception, index, memory)
     cameras = forecast_cameras(perception, index, ahead) if future_from_cur is None else list(future_from_cur)
     if len(cameras) < steps:
         raise ValueError(f"`future_from_cur` must be of {steps} steps or more, got {len(cameras)}")
-    clouds = _clouds(perception, index, paths or point_paths(perception, index))
+    clouds = _clouds(perception, index, paths or point_paths(perception, index), remembered)
     start, frames = time.perf_counter(), list[dict[str, Rendered]]()
     for step in ahead:
         moved = [cloud(step, [np.eye(4), *cameras]) for cloud in clouds]
@@ -129,13 +138,16 @@ def gap_notes(perception: Perception, index: int) -> tuple[str, ...]:
     return (f"frames {names} are {gap:.3g} s apart, too far to be matched: motion goes on as before the gap",)
 
 
-def show_frame(perception: Perception, index: int, views: Sequence[View]) -> dict[str, Rendered]:
+def show_frame(
+    perception: Perception, index: int, views: Sequence[View], *, memory: int = MEMORY
+) -> dict[str, Rendered]:
     """A frame itself as other cameras see it, at the same time.
 
     Args:
         perception: of the clip.
         index: the frame t, 1 or more.
         views: cameras at t, ``tgt_from_next`` from the source camera there.
+        memory: as in `forecast_frames`.
 
     Returns:
         By the views' names.
@@ -144,7 +156,8 @@ def show_frame(perception: Perception, index: int, views: Sequence[View]) -> dic
         ValueError: a clip that depth can't be had for.
     """
     clip = perception.clip
-    clouds = [cloud(0, [np.eye(4)]) for cloud in _clouds(perception, index, Paths(perception.frame(index)))]
+    remembered, paths = remember(perception, index, memory), Paths(perception.frame(index))
+    clouds = [cloud(0, [np.eye(4)]) for cloud in _clouds(perception, index, paths, remembered)]
     return {view.name: _render(clouds, clip[index].K if view.K is None else view.K, view, clip) for view in views}
 
 
@@ -152,8 +165,8 @@ MovingCloud = Callable[[int, list[NDArray[np.float64]]], Cloud]
 """A cloud at a step, given ``future_from_cur`` of all steps from 0."""
 
 
-def _clouds(perception: Perception, index: int, paths: Paths) -> list[MovingCloud]:
-    """What the current frame shows; what the one before did; what is behind the current foreground."""
+def _clouds(perception: Perception, index: int, paths: Paths, memory: Memory | None = None) -> list[MovingCloud]:
+    """What the current frame shows; what the one before did; what is remembered; what is behind the foreground."""
     K = perception.clip[index].K
     cur, prev = perception.seen(index), perception.seen(index - 1)
     cur_from_prev = np.asarray(np.linalg.inv(perception.prev_from_cur(index)), np.float64)
@@ -163,7 +176,7 @@ def _clouds(perception: Perception, index: int, paths: Paths) -> list[MovingClou
     before = _cloud(image_prev, prev.layers.depth, ~prev.own, K, prev.velocity, *since)
     hidden = ~cur.layers.mask & ~cur.own
     behind = _cloud(cur.layers.background_image, cur.layers.background_depth, hidden, K)
-    return [shown, before, behind]
+    return [shown, before, *([] if memory is None else [_static(memory)]), behind]
 
 
 def _shown(paths: Paths, own: NDArray[np.bool_]) -> MovingCloud:
@@ -214,22 +227,45 @@ def _cloud(
     return at
 
 
+def _static(memory: Memory) -> MovingCloud:
+    """What is remembered, at rest in the world."""
+
+    def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
+        there, before = (_transform(future_from_cur[k], memory.points_xyz) for k in (step, step - 1))
+        seen_at = memory.z_src, memory.image
+        return Cloud(
+            there.astype(np.float32), *seen_at, (there - before).astype(np.float32), memory.rows, memory.columns
+        )
+
+    return at
+
+
 def _transform(dst_from_src: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     return points @ dst_from_src[:3, :3].T + dst_from_src[:3, 3]
 
 
 def _render(clouds: list[Cloud], K: NDArray[np.float64], view: View, clip: Clip) -> Rendered:
-    """What was seen, in its holes what is behind the foreground, and in what is still open what surrounds it.
+    """What was seen, in its holes what is remembered, then what is behind the foreground, then what surrounds them.
 
     The inpainted background is a guess, and only wanted where the foreground has moved away: cracks, and what enters
     the picture from outside, are better guessed from beside. On kitti_clip's traffic that is worth 3 dB.
     """
-    height, width = clip[0].height, clip[0].width
-    seen = show(clouds[:-1], K, view.tgt_from_next, height, width)
-    shown, hole = seen, holes(seen)
-    deep = deep_holes(hole)
+    seen_from = K, view.tgt_from_next, clip[0].height, clip[0].width
+    shown = show(clouds[:2], *seen_from)
+    hole = holes(shown)
+    if len(clouds) > 3 and hole.any():
+        shown = _filled(shown, show(clouds[2:3], *seen_from), hole)
+        hole = holes(shown)
+    coverage, deep = shown.coverage, deep_holes(hole)
     if deep.any():
-        behind = show(clouds[-1:], K, view.tgt_from_next, height, width)
+        behind = show(clouds[-1:], *seen_from)
         deep &= ~holes(behind)
-        shown, hole = Shown(np.where(deep, behind.planes, seen.planes), seen.coverage), hole & ~deep
-    return rendered(shown, fill_holes(shown.planes[:3], shown.planes[3:4], hole))
+        shown, hole = Shown(_filled(shown, behind, deep).planes, coverage), hole & ~deep
+    ahead = K @ view.tgt_from_next[:3, 2]
+    vanishing_uv = ahead[:2] / ahead[2] if ahead[2] > _AHEAD else None
+    return rendered(shown, fill_holes(shown.planes[:3], shown.planes[3:4], hole, vanishing_uv))
+
+
+def _filled(shown: Shown, other: Shown, where: NDArray[np.bool_]) -> Shown:
+    """``other`` in place of ``shown`` at ``where`` [1, H, W]."""
+    return Shown(np.where(where, other.planes, shown.planes), np.where(where, other.coverage, shown.coverage))

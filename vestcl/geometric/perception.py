@@ -108,6 +108,7 @@ class Perception:
         self.seconds: dict[str, float] = {}
         self._progress = progress
         self._kept: dict[tuple[str, int], Any] = {}
+        self._lifetimes: dict[tuple[str, int], int] = {}
         self._inner = 0.0
         self._lock = threading.RLock()
         self._empty: set[int] = set()
@@ -180,13 +181,14 @@ class Perception:
             return _INVERSE_STD
         return _DISPARITY_STD / -float(sample.K[0, 0] * sample.right.right_from_left[0, 3])
 
-    def once(self, stage: str, index: int, compute: Callable[[], Result]) -> Result:
+    def once(self, stage: str, index: int, compute: Callable[[], Result], *, lifetime: int = 0) -> Result:
         """``compute``'s result, kept with the frame's others; its time counts as the stage's.
 
         Args:
             stage: its name in ``seconds``.
             index: the frame.
             compute: called if the result is not there.
+            lifetime: frames that the result is kept for, if more than usual.
         """
         key = (stage, index)
         with self._lock:
@@ -194,9 +196,17 @@ class Perception:
                 if self._progress:
                     self._progress(stage)
                 self._kept[key] = self._timed(stage, compute)
-                for old in [kept for kept in self._kept if not index - _KEPT < kept[1] <= index + _KEPT]:
-                    del self._kept[old]
+                self._lifetimes[key] = max(lifetime, _KEPT)
+                self._forget(index)
             return self._kept[key]
+
+    def _forget(self, index: int) -> None:
+        """Drop what frame ``index`` and those after it no longer need."""
+        for key in list(self._kept):
+            lifetime = self._lifetimes.get(key, _KEPT)
+            if not index - lifetime < key[1] <= index + lifetime:
+                del self._kept[key]
+                self._lifetimes.pop(key, None)
 
     def _timed(self, stage: str, compute: Callable[[], Result]) -> Result:
         """``compute``'s result; its time counts as the stage's, but for the stages that ran inside."""

@@ -32,7 +32,7 @@ _OPAQUE: Final = 0.5
 _NEIGHBOURS, _LINE = 3, 1.1
 
 #: Less coverage than that is a hole.
-_HOLE: Final = 0.05
+HOLE: Final = 0.05
 
 #: A pixel shows one surface if its points were seen within so many pixels of each other (standard deviation), and the
 #: place where its own surface was seen is no farther than that from their mean. Elsewhere colours are mixed.
@@ -95,7 +95,7 @@ def show(
     uncovered = np.ones((1, height, width), np.float32)
     for cloud in clouds:
         image, coverage = _splat(cloud, K, tgt_from_next, height, width)
-        opacity = np.minimum(coverage / np.float32(_OPAQUE), 1) * (coverage > _HOLE)
+        opacity = np.minimum(coverage / np.float32(_OPAQUE), 1) * (coverage > HOLE)
         planes += left * opacity * image / np.maximum(coverage, np.float32(1e-6))
         left = left * (1 - opacity)
         uncovered = uncovered * (1 - coverage)
@@ -203,11 +203,11 @@ def _surface(
 
 def rendered(shown: Shown, image: NDArray[np.float32]) -> Rendered:
     """The view as a forecast holds it, with ``image`` [3, H, W] in place of the splatted colour."""
-    inverse, seen = shown.planes[3:4], shown.coverage > _HOLE
+    inverse, seen = shown.planes[3:4], shown.coverage > HOLE
     depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=seen & (inverse > 0))
     return Rendered(image.clip(0, 1), depth, shown.coverage, np.where(seen, shown.planes[4:], np.float32(0)))
 
 
 def holes(shown: Shown) -> NDArray[np.bool_]:
     """[1, H, W], True where nothing is seen."""
-    return shown.coverage <= _HOLE
+    return shown.coverage <= HOLE

@@ -1,10 +1,12 @@
-"""What nobody has seen: holes of a view, filled smoothly from what surrounds them."""
+"""What nobody has seen: holes of a view, filled smoothly from what surrounds them, and at the sides with structure."""
 
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from vestcl.scene.sides import carry_on
 
 #: Surroundings count by 1 / (1/z + that)^2, 1/m: what was hidden is likelier to go on behind a hole than what hid it.
 _FAR: Final = 0.01
@@ -14,16 +16,21 @@ _CRACK: Final = 0.006
 
 
 def fill_holes(
-    image: NDArray[np.float32], inverse_depth: NDArray[np.float32], hole: NDArray[np.bool_]
+    image: NDArray[np.float32],
+    inverse_depth: NDArray[np.float32],
+    hole: NDArray[np.bool_],
+    vanishing_uv: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float32]:
     """Push and pull: a hole takes the weighted mean of the next coarser level, which is filled likewise.
 
-    Holes inside are filled from the far side first, those that reach the border from all sides alike.
+    Holes inside are filled from the far side first, those that reach the border from all sides alike;
+    there what is seen goes on along the lines through the vanishing point, if that is known (`carry_on`).
 
     Args:
         image: [C, H, W]; what is in the holes does not matter.
         inverse_depth: [1, H, W], 1/m.
         hole: [1, H, W], True = to be filled.
+        vanishing_uv: [2] px, where lines along the road meet; None = unknown.
 
     Returns:
         [C, H, W]; ``image`` outside the holes. All 0 if everything is a hole.
@@ -36,7 +43,10 @@ def fill_holes(
     planes = np.ascontiguousarray(np.where(hole, np.float32(0), image).transpose(1, 2, 0))
     known = (np.where(hole[0], np.float32(0), weight) for weight in (far[0], np.ones_like(far[0])))
     inside, outside = (_pull(planes, weight.astype(np.float32))[0] for weight in known)
-    filled = np.where(_at_border(hole[0])[..., None], outside, inside).transpose(2, 0, 1)
+    at_border = _at_border(hole[0])
+    filled = np.where(at_border[..., None], outside, inside).transpose(2, 0, 1)
+    if vanishing_uv is not None:
+        filled = carry_on(np.where(hole, filled, image), hole[0], at_border, vanishing_uv)
     return np.where(hole, filled, image)
 
 
