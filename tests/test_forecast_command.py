@@ -254,6 +254,8 @@ def test_weights_of_distances(
         ("--view above", "--view must be"),
         ("--view right --view right", "got right twice"),
         ("--perceive splatted", "--perceive is how a network sees its own forecast; it needs --model"),
+        ("--memory -1", "--memory must be 0 frames or more, got -1"),
+        ("--memory 2 --model vest-s", "--memory is of the geometric forecast: it can't be combined with --model"),
         ("--mode feedback", "--mode is how a network goes on after its first step; it needs --model"),
         ("--model vest-xl", "vest-xl: is no model: no file, no checkpoint's folder, and none of vest-s"),
         ("--squeeze x.pth", "--squeeze is a distance to the truth; it needs --compare"),
@@ -299,3 +301,9 @@ def test_an_out_that_is_a_file_is_one_line(
     assert capsys.readouterr().err == f"error: --out must be a folder, got the file {taken}\n"
     assert not repeater.calls
     assert taken.read_text() == "mine\n"
+
+
+def test_the_number_of_remembered_frames(folder: Path, tmp_path: Path, repeater: Repeater) -> None:
+    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1"]
+    assert cli.main([*told, "--memory", "5"]) == 0 and cli.main(told) == 0
+    assert repeater.networks == [(5,), ()]
