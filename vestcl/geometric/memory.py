@@ -24,9 +24,11 @@ MEMORY: Final = 3
 #: shows, both in an image 832 wide: masks are inexact, and surfaces have to overlap to be closed.
 _DILATE, _MARGIN, _WIDTH = 10, 4, 832
 
-#: A frame covers points that are no farther than its own surface by this factor, and depth jumps between pixels by
-#: another one: of 1.1 and 1.3 the latter has the better PSNR on KITTI's stereo, and the same elsewhere.
+#: A frame covers points that are no farther than its own surface by this factor: of 1.1 and 1.3 the latter has the
+#: better PSNR on KITTI's stereo, and the same elsewhere.
 _SURFACE: Final = 1.3
+
+#: Depth jumps where neighbouring pixels differ by more than this factor; leaving such pixels out gains ST-LPIPS.
 _JUMP: Final = 1.3
 
 #: Two depths are of one surface if they differ by no more than that share; a scale is looked for among twice of it.
