@@ -12,8 +12,9 @@ from data_files import pose, real
 from vestcl import baselines
 from vestcl.data import Street
 from vestcl.data.kitti_odometry import open_kitti_odometry
-from vestcl.data.sample import Clip
+from vestcl.data.sample import Clip, Sample
 from vestcl.data.video import open_video
+from vestcl.geometric import perception
 from vestcl.io.labels import SKY
 from vestcl.scene import motion_pose
 from vestcl.scene.correspondence import correspond
@@ -50,6 +51,36 @@ def test_consecutive_frames_share_a_scale() -> None:
     images, _ = drive(ahead(frames=5))
     lengths = [np.linalg.norm(motion_depth(images[i : i + 4], K).prev_from_cur[:3, 3]) for i in (0, 1)]
     assert abs(lengths[0] / lengths[1] - 1) < 0.05
+
+
+def along(metres: float) -> Any:
+    return pose(0.0, (0.0, 0.0, metres))
+
+
+def test_parallax_gives_the_ratio_of_speeds() -> None:
+    steps = (0.0, 0.3, 0.8, 1.2)  # m driven: intervals of .3, .5 and .4 m
+    images, _ = drive([along(step) for step in steps])
+    assert abs(motion_depth(images, K).speed_before - 0.5 / 0.4) < 0.06
+    assert abs(motion_depth(images[:3], K).speed_before - 0.3 / 0.5) < 0.06
+    assert motion_depth(images[:2], K).speed_before == 0, "two images know one motion"
+
+
+def test_a_clips_motions_have_one_scale(monkeypatch: pytest.MonkeyPatch) -> None:
+    images, _ = drive([along(0.4 * i) for i in range(4)])
+    samples = [Sample.from_arrays(f"{i}", image, K) for i, image in enumerate(images)]
+    factors, made = iter((1.0, 1.5, 0.7)), motion_depth
+
+    def another_road(*args: Any, **options: Any) -> MotionDepth:
+        found, factor = made(*args, **options), next(factors)
+        found.prev_from_cur[:3, 3] *= factor
+        return found._replace(depth=found.depth * np.float32(factor))
+
+    monkeypatch.setattr(perception, "motion_depth", another_road)
+    seen = perception.Perception(Clip("corridor", "memory", tuple(samples)))
+    lengths = [np.linalg.norm(motion[:3, 3]) for motion in seen.motions([1, 2, 3])]
+    assert np.ptp(lengths) < 0.06 * lengths[-1]
+    own = [np.linalg.norm(seen.prev_from_cur(i)[:3, 3]) for i in (1, 2, 3)]
+    assert lengths[-1] == own[-1] and np.ptp(own) > 0.4 * own[-1]
 
 
 def test_same_frames_same_bits() -> None:

@@ -83,7 +83,7 @@ def given_input(perception: Perception, index: int, prior: str, steps: int = 1, 
 def forecast_path(perception: Perception, index: int, steps: int, back: int = 0) -> CameraPath:
     """The camera's motion as the geometric forecast has it; arguments as of `given_input`."""
     clip, seen = perception.clip, range(max(index + back - PAST + 1, 1), index + 1)
-    motions = [np.asarray(np.linalg.inv(perception.prev_from_cur(i)), np.float64) for i in seen]
+    motions = [np.asarray(np.linalg.inv(motion), np.float64) for motion in perception.motions(seen)]
     return camera_path(motions, list(map(clip.elapsed, seen)), clip.interval, steps, perception.is_monocular(index))
 
 

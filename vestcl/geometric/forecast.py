@@ -173,7 +173,8 @@ def _clouds(perception: Perception, index: int, paths: Paths, memory: Memory | N
     shown = _shown(paths, cur.own)
     since = cur_from_prev, perception.clip.elapsed(index)
     image_prev = as_exposed(prev.layers.image, cur.layers.image, perception.correspondence(index).flow_uv)
-    before = _cloud(image_prev, prev.layers.depth, ~prev.own, K, prev.velocity, *since)
+    scale = np.float32(perception.scale_before(index))
+    before = _cloud(image_prev, scale * prev.layers.depth, ~prev.own, K, scale * prev.velocity, *since)
     hidden = ~cur.layers.mask & ~cur.own
     behind = _cloud(cur.layers.background_image, cur.layers.background_depth, hidden, K)
     return [shown, before, *([] if memory is None else [_static(memory)]), behind]

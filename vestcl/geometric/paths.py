@@ -85,7 +85,7 @@ def forecast_cameras(
     so that nothing has to be looked at only for the test.
     """
     clip, seen = perception.clip, range(max(index + back - _MOTIONS + 1, 1), index + 1)
-    motions = [np.linalg.inv(perception.prev_from_cur(i)) for i in seen]
+    motions = [np.linalg.inv(motion) for motion in perception.motions(seen)]
     interval = clip.interval or _INTERVAL
     times = [clip.elapsed(i) * interval for i in seen], [each * interval for each in ahead]
     return forecast_camera(motions, *times, by_flow=perception.is_monocular(index))

@@ -5,7 +5,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
@@ -130,6 +130,28 @@ class Perception:
     def prev_from_cur(self, index: int) -> NDArray[np.float64]:
         """[4, 4] m: the camera's motion from frame ``index`` to the one before."""
         return self.once("ego-motion", index, lambda: self._ego_motion(index))
+
+    def motions(self, indices: Sequence[int]) -> list[NDArray[np.float64]]:
+        """`prev_from_cur` of consecutive frames, all in the scale of the last one where depth comes from motion.
+
+        There each frame's road gives it a scale of its own; parallax over three images gives the ratio of their speeds.
+
+        Args:
+            indices: of the frames, rising by one.
+        """
+        motions, scale = [self.prev_from_cur(i).copy() for i in indices], 1.0
+        for motion, later in zip(motions[-2::-1], list(indices)[:0:-1], strict=True):
+            scale *= self.scale_before(later)
+            motion[:3, 3] *= scale
+        return motions
+
+    def scale_before(self, index: int) -> float:
+        """What lengths in the scale of frame ``index`` - 1 are multiplied with to be in that of frame ``index``."""
+        if index < 2 or not self._is_from_motion(index):
+            return 1.0
+        now, before = (float(np.linalg.norm(self.prev_from_cur(i)[:3, 3])) for i in (index, index - 1))
+        scaled = self._from_motion(index).speed_before * now
+        return scaled / before if scaled and before else 1.0
 
     def is_lost(self, index: int) -> bool:
         """Whether the frame before is too far away in time to be matched, and there is a motion before that."""
@@ -258,7 +280,10 @@ class Perception:
 
     def is_monocular(self, index: int) -> bool:
         """Whether depth comes, wholly or in part, from the motion of one camera."""
-        return self._is_estimated(index) or (self.clip[index].right is None and self._given_depth(index) is None)
+        return self._is_estimated(index) or self._is_from_motion(index)
+
+    def _is_from_motion(self, index: int) -> bool:
+        return self.clip[index].right is None and self._given_depth(index) is None
 
     def _is_estimated(self, index: int) -> bool:
         """Whether depth is a network's, to be combined with motion's: without a stereo pair, or without a unit."""

@@ -50,6 +50,9 @@ class MotionDepth(NamedTuple):
     """[4, 4] m: from the last camera to the one before, in the same scale; no translation if the car stands."""
     confidence: NDArray[np.float32]
     """[1, H, W] in [0, 1]: 1 = measured, 0 = a guess from the road and from what is around."""
+    speed_before: float = 0.0
+    """Length of the motion before over that of this one, by parallax; 0 = unknown. The road gives each frame a scale of
+    its own, which differs by more than a car's speed does."""
 
 
 def motion_depth(
@@ -97,7 +100,8 @@ def motion_depth(
     metres = _metres(measured, plane, camera_height)
     motion[:3, 3] *= metres * measured.lengths[0]
     scaled = measured._replace(inverse=measured.inverse / metres, std=measured.std / metres)
-    return _complete(scaled, _ground(plane, rays, camera_height), pictures[-1], motion)
+    complete = _complete(scaled, _ground(plane, rays, camera_height), pictures[-1], motion)
+    return complete._replace(speed_before=measured.speed_before)
 
 
 def observe(

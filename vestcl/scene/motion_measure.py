@@ -48,6 +48,8 @@ class Measured(NamedTuple):
     """[H, W], True where reliable flow leads off the epipolar line, or behind infinity."""
     lengths: list[float]
     """Per view the length of its translation in units; 0 where it only turned or is not believed."""
+    speed_before: float = 0.0
+    """Length of the motion to the last image but one over that of the motion to the last one; 0 = unknown."""
 
 
 def measure(
@@ -93,7 +95,16 @@ def measure(
     known = weight > 0
     mean = np.divide(total, weight, out=np.zeros_like(total), where=known)
     std = np.where(known, np.maximum(weight, 1e-12) ** -0.5, np.inf)
-    return Measured(mean, std, moving | (known & (mean < -_AGREE * std)), lengths)
+    return Measured(mean, std, moving | (known & (mean < -_AGREE * std)), lengths, _speed_before(poses, lengths))
+
+
+def _speed_before(poses: Sequence[Pose], lengths: Sequence[float]) -> float:
+    """|x_2 t_2 - R_2 R_1^T x_1 t_1| / x_1, of the motions R, t of length x to the earlier images."""
+    if len(poses) < 2 or not lengths[0] or not lengths[1]:
+        return 0.0
+    (turn, step), (turn_both, both) = ((pose.dst_from_src[:3, :3], pose.dst_from_src[:3, 3]) for pose in poses[:2])
+    before = lengths[1] * both - lengths[0] * turn_both @ turn.T @ step
+    return float(np.linalg.norm(before) / lengths[0])
 
 
 def moving_by_turn(correspondence: Correspondence, turn: Array, K: Array) -> NDArray[np.bool_]:
