@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from vestcl.prepared import Prepared
 
 #: Raised when perception, the procedural street or these files change: it makes every frame be computed anew.
-RECIPE: Final = "vestcl prepared 3"
+RECIPE: Final = "vestcl prepared 4"
 
 JSON: Final = "clip.json"
 
