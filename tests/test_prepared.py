@@ -164,8 +164,8 @@ def test_a_missing_file_and_one_of_another_run(noise: tuple[Path, Prepared]) -> 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('{"recipe": "vestcl prepared 0"}', "must be 'vestcl prepared 3', got 'vestcl prepared 0'; run `vestcl prep"),
-        ('{"recipe": "vestcl prepared 3"}', "is damaged"),
+        ('{"recipe": "vestcl prepared 0"}', "must be 'vestcl prepared 4', got 'vestcl prepared 0'; run `vestcl prep"),
+        ('{"recipe": "vestcl prepared 4"}', "is damaged"),
         ("[]", "is damaged"),
         ('{"recipe": "vest', "is damaged"),
         ("\x00", "is damaged"),
