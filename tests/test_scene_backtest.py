@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vestcl.scene.motion.backtest import Frame, backtest, by_step, candidates, mixed, residual_flow
+from vestcl.scene.motion.backtest import Frame, backtest, by_step, candidates, coherent, mixed, residual_flow
+from vestcl.scene.parallax import pixel_centres
 
 HEIGHT, WIDTH, FOCAL, DEPTH = 64, 160, 100.0, 10.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
@@ -147,3 +148,19 @@ def test_errors_by_step() -> None:
     held = by_step([first, second], by_flow=True)
     np.testing.assert_allclose(held[0][-1] / once[-1], 1.2**6, rtol=1e-4)
     np.testing.assert_allclose(held[0][:-1], once[:-1])
+
+
+def test_what_no_candidate_explains_follows_its_surroundings() -> None:
+    image = np.full((3, 40, 80), 0.2, np.float32)
+    car, window = np.s_[10:30, 20:50], np.s_[14:20, 30:40]
+    image[(slice(None), *car)] = 0.7
+    way = np.zeros((2, 40, 80), np.float32)
+    way[0][car] = 5
+    way[0][window] = -9  # of a wrong depth
+    errors = np.full((2, 40, 80), 1e-5, np.float32)
+    errors[(slice(None), *window)] = 0.03
+    centres = pixel_centres(40, 80)
+    found = coherent(np.asarray(centres + way, np.float32), errors, image) - centres
+    assert np.abs(found[0][window] - 5).max() < 0.6, "the window goes with its car"
+    assert np.abs(found[0, 4:9] - 0).max() < 0.1 and np.abs(found[0, 22:28, 24:46] - 5).max() < 0.1
+    assert np.abs(found[1]).max() < 1e-3

@@ -47,7 +47,7 @@ class Paths:
             return np.tensordot(future_from_cur[:3, :3], points, 1) + future_from_cur[:3, 3, None, None]
         positions, depth = backtest.candidates(self.frame, self._residual, future_from_cur, ahead, self.by_flow)
         errors = self.errors[0] if ahead <= 1 else self.errors[-1]
-        u, v = backtest.mixed(positions, errors)
+        u, v = backtest.coherent(backtest.mixed(positions, errors), errors, self.frame.image)
         return np.tensordot(np.linalg.inv(self.frame.K), np.stack([u, v, np.ones_like(u)]), 1) * depth
 
 
