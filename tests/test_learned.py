@@ -16,11 +16,11 @@ from vestcl import geometric, learned_backtest, network, pretrained
 from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.forecast import LearnedPart, View
-from vestcl.geometric import Perception
+from vestcl.geometric import Perception, render
 from vestcl.geometric.paths import forecast_cameras, point_paths
 from vestcl.learned import CorrectedPaths, corrections, forecast_path, given_input
 from vestcl.learned_backtest import choose_parts
-from vestcl.models.config import EgoMotionConfig
+from vestcl.models.config import MOST_CHANGE, EgoMotionConfig
 from vestcl.models.forecaster import Forecaster
 
 HEIGHT, WIDTH = 48, 160
@@ -249,6 +249,44 @@ def test_refinement_that_is_better_is_added(monkeypatch: pytest.MonkeyPatch) -> 
         assert np.abs(got - wanted)[inside].max() < 1e-4 and np.abs(added).max() > 0.01
         assert np.array_equal(got, made.frames[step]["again"].image)
         assert not np.array_equal(made.frames[step]["right"].image, plain.frames[step]["right"].image)
+
+
+def test_a_refinement_of_forecasts_is_tested_on_them() -> None:
+    """What it adds to the forecast of frames that were seen decides; all views and steps get it."""
+    made = forecast_refinement()
+    still = network.forecast_frames(perception(), made, 4, 2, VIEWS)
+    assert not still.learned["refinement"].used
+    assert_geometric(still)
+    darker = forecast_refinement(-0.05)
+    assert not network.forecast_frames(perception(), darker, 4, 1, VIEWS).learned["refinement"].used
+
+
+def test_a_refinement_of_forecasts_that_is_better_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every geometric forecast is 0.05 too dark: what brightens it wins both tests."""
+    original = render.rendered
+
+    def dark(*arguments: Any) -> Any:
+        found = original(*arguments)
+        return dataclasses.replace(found, image=(found.image - np.float32(0.05)).clip(0, 1))
+
+    plain = geometric.forecast_frames(perception(), 4, 2, VIEWS)
+    monkeypatch.setattr("vestcl.geometric.forecast.rendered", dark)
+    forecast = network.forecast_frames(perception(), forecast_refinement(0.05), 4, 2, VIEWS)
+    assert forecast.learned["refinement"].used and forecast.learned["refinement"].why.count("dB at frame") == 2
+    for frame, wanted in zip(forecast.frames, plain.frames, strict=True):
+        for name in ("source", "right"):
+            inside = (wanted[name].image > 0.06) & (wanted[name].coverage > 0.6)
+            np.testing.assert_allclose(frame[name].image[inside], wanted[name].image[inside], atol=1e-4)
+    assert forecast.profile["refine"] > 0 and forecast.profile["splat"] == 0
+
+
+def forecast_refinement(brighter: float = 0.0) -> Forecaster:
+    """A refinement of geometric forecasts that brightens covered pixels by so much."""
+    refine = dataclasses.replace(BOUNDED.refine, refines="forecast")
+    made = Forecaster(dataclasses.replace(BOUNDED, refine=refine)).eval()
+    assert made.refine.out.bias is not None
+    nn.init.constant_(made.refine.out.bias, float(np.arctanh(brighter / MOST_CHANGE)))
+    return made
 
 
 def test_only_frames_up_to_t_are_read() -> None:

@@ -8,7 +8,14 @@ from tolerances import assert_close
 from torch.autograd import gradcheck
 
 from vestcl.models import Refine, configuration
-from vestcl.models.config import LEAST_COVERAGE, RefineConfig, RenderConfig
+from vestcl.models.config import (
+    FORECAST_PLANES,
+    LEAST_COVERAGE,
+    MOST_CHANGE,
+    OPAQUE,
+    RefineConfig,
+    RenderConfig,
+)
 from vestcl.models.refine import fill
 
 FEATURES = 3
@@ -196,3 +203,34 @@ def test_gradients_of_filling() -> None:
     image = torch.rand(1, 2, 5, 6, dtype=torch.float64, requires_grad=True)
     opacity = (0.05 + 0.1 * torch.rand(1, 1, 5, 6, dtype=torch.float64)).requires_grad_()
     assert gradcheck(fill, (image, opacity))
+
+
+# ---------------------------------------------------------------- of geometric forecasts
+
+
+def of_forecast() -> Refine:
+    return Refine(RefineConfig(stem=4, stem_kernel=3, widths=(6, 8), base="filled", refines="forecast"), FILLED)
+
+
+def test_a_forecast_is_unchanged_at_the_start() -> None:
+    planes = torch.rand(2, FORECAST_PLANES, 20, 28)
+    assert torch.equal(of_forecast()(planes), planes[:, :3])
+
+
+def test_covered_pixels_change_modestly() -> None:
+    """y is huge: a covered pixel changes by MOST_CHANGE, half as much coverage as OPAQUE lets half of the rest."""
+    network = of_forecast().train()
+    assert network.out.bias is not None
+    torch.nn.init.constant_(network.out.bias, 50.0)
+    planes = torch.zeros(1, FORECAST_PLANES, 6, 6)
+    planes[:, 3, 0], planes[:, 3, 1] = 1.0, OPAQUE / 2
+    image = network(planes)
+    for row, wanted in ((0, MOST_CHANGE), (1, (1 + MOST_CHANGE) / 2), (2, 1.0)):
+        torch.testing.assert_close(image[:, :, row], torch.full((1, 3, 6), wanted))
+
+
+def test_a_forecast_has_an_image_to_add_to() -> None:
+    with pytest.raises(ValueError, match='`base` must not be "none"'):
+        RefineConfig(refines="forecast")
+    with pytest.raises(ValueError, match='`refines` must be "clouds" or "forecast"'):
+        RefineConfig(refines="clods")  # type: ignore[arg-type]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vestcl import geometry
 from vestcl.forecast import LearnedPart, Rendered, View
+from vestcl.forecast_planes import forecast_planes
 from vestcl.geometric.paths import Paths
 from vestcl.geometric.perception import Perception
 from vestcl.models._render import looks_of
@@ -136,6 +137,11 @@ def refined(
     frames: Sequence[Mapping[str, Rendered]],
 ) -> list[dict[str, Rendered]]:
     """``frames`` of the geometric forecast, under ``motion``, with what refinement adds to their images."""
+    if model.refine.of_forecast:
+        return [
+            {name: retouched(model, rendered, ahead, perception.clip.interval) for name, rendered in frame.items()}
+            for ahead, frame in enumerate(frames, 1)
+        ]
     path = forecast_path(perception, index, 1)._replace(future_from_cur=motion.cameras)
     given = given_motion(perception, index, path)
     added = added_by_refinement(model, given, motion, views, range(1, len(frames) + 1))
@@ -144,6 +150,19 @@ def refined(
         images = {name: change + (frame[name].image if adds else 0) for name, (change, adds) in by_view.items()}
         done.append({name: replace(frame[name], image=image.clip(0, 1)) for name, image in images.items()})
     return done
+
+
+def retouched(model: Forecaster, rendered: Rendered, ahead: int, interval: float | None) -> Rendered:
+    """A frame of a geometric forecast with what a refinement of such forecasts adds; arguments as of `forecast_planes`.
+
+    Args:
+        model: with `RefineConfig.refines` "forecast".
+        rendered: the frame.
+        ahead: frame intervals ahead.
+        interval: seconds.
+    """
+    added = model.retouch(torch.from_numpy(forecast_planes(rendered, ahead, interval))[None])[0].float().numpy()
+    return replace(rendered, image=(rendered.image + added).clip(0, 1))
 
 
 def added_by_refinement(

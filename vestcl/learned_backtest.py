@@ -8,7 +8,8 @@ t - h that is forecast to be at q in t, with what refinement adds there, a(q):
 Camera first, then objects under the camera's result, then refinement under both, at t from t - 1. What wins there is
 tested at t - 1 from t - 2, as one frame says little of the next; and motion at t from t - 2, as it is extrapolated
 further. What can't be tested is left out. A test takes the networks on two frames once, of which a sequence has encoded
-all already, and for refinement one view.
+all already, and for refinement one view. A refinement of geometric forecasts is tested on such a forecast of t itself,
+pixel by pixel; what earlier frames are remembered for is not in it.
 
 Source: SPEC section 12.
 """
@@ -21,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.forecast import LearnedPart, View
+from vestcl.geometric.forecast import forecast_frames as forecast_geometric
+from vestcl.geometric.paths import point_paths
 from vestcl.geometric.perception import Perception
 from vestcl.learned import (
     CAMERA,
@@ -28,6 +31,7 @@ from vestcl.learned import (
     PARTS,
     REFINEMENT,
     Array,
+    CorrectedPaths,
     Corrections,
     Matrix,
     added_by_refinement,
@@ -35,6 +39,7 @@ from vestcl.learned import (
     forecast_path,
     given_input,
     given_motion,
+    retouched,
 )
 from vestcl.models.forecaster import Forecaster
 from vestcl.scene.correspondence import sample
@@ -113,13 +118,28 @@ def _tested(
             chosen[OBJECTS] = test.verdict(*pair, where=moved)
             if chosen[OBJECTS].used:
                 velocities = [found.velocity_prev, found.velocity_cur]
-    if REFINEMENT in parts:
-        motion = Corrections((camera,), *velocities)
+    motion = Corrections((camera,), *velocities)
+    if REFINEMENT in parts and model.refine.of_forecast:
+        chosen[REFINEMENT] = test.verdict_on_images(*_with_and_without(perception, model, start, motion))
+    elif REFINEMENT in parts:
         given = given_motion(perception, start, path._replace(future_from_cur=(camera,)))
         ((added, adds),) = (shown["source"] for shown in added_by_refinement(model, given, motion, [_SOURCE], [1]))
         at = test.positions(camera, velocities[1])
         chosen[REFINEMENT] = test.verdict(at, at, added=added, adds=adds)
     return chosen
+
+
+def _with_and_without(
+    perception: Perception, model: Forecaster, start: int, motion: Corrections
+) -> tuple[Array, Array]:
+    """Frame ``start`` + 1 [3, H, W] by geometry under ``motion``, without refinement and with it."""
+    paths = point_paths(perception, start)
+    moved = CorrectedPaths(paths.frame, paths.errors, paths.by_flow, motion.velocity_cur if motion.moves else None)
+    frames = forecast_geometric(
+        perception, start, 1, [_SOURCE], future_from_cur=motion.cameras, paths=moved, memory=0
+    ).frames
+    rendered = frames[0]["source"]
+    return rendered.image, retouched(model, rendered, 1, perception.clip.interval).image
 
 
 def _present(model: Forecaster) -> list[str]:
@@ -204,7 +224,18 @@ class _Test(NamedTuple):
         new = old
         if added is not None:
             new = sample(added, with_it[0] - 0.5, with_it[1] - 0.5) + (old if adds else np.float32(0))
-        errors = [self._errors(at, image) for at, image in ((without, old), (with_it, new))]
+        return self._of_errors(self._errors(without, old), self._errors(with_it, new), counts)
+
+    def verdict_on_images(self, without: Array, with_it: Array) -> LearnedPart:
+        """Whether the error of the frame itself is less by `MARGIN` with a part: [3, H, W], of forecasts of it."""
+        before, after = (
+            np.minimum(np.square(one - self.image).mean(axis=0), np.float32(MOST)) for one in (without, with_it)
+        )
+        return self._of_errors(before, after, self.counts)
+
+    def _of_errors(self, without: Array, with_it: Array, counts: NDArray[np.bool_]) -> LearnedPart:
+        """The choice by squared errors of pixels, of which those of ``counts`` count."""
+        errors = without, with_it
         counts = counts & np.isfinite(errors[0]) & np.isfinite(errors[1])
         if counts.sum() < _FEWEST:
             return LearnedPart(False, "what it changes is too small to be tested")

@@ -33,6 +33,9 @@ STAGES: Final = {
     "paint": "refine",
 }
 
+#: Methods that do the work of a stage in another way: their time is its time.
+_OTHER_WAYS: Final = {"retouch": "refine"}
+
 #: Rigid flow of both frames, checks, composing the view.
 REST: Final = "rest"
 
@@ -95,7 +98,7 @@ def watching(seen: Seen | None = None) -> Iterator[Stopwatch]:
 
 def timed(method: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Let a method of STAGES report its time to the thread's `watching`, to `vestcl.trace` and to torch's profiler."""
-    name = STAGES[method.__name__]
+    name = (STAGES | _OTHER_WAYS)[method.__name__]
 
     @functools.wraps(method)
     def stage(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:

@@ -236,9 +236,12 @@ class Stages(nn.Module):
     def paint(self, sides: Sequence[Side]) -> torch.Tensor:
         """The refined image [B, 3, H, W], from the channels that `RenderConfig.channels` counts.
 
-        What refinement adds to its base is computed at `Effort.paint_scale`, from means over the sides' cells.
+        What refinement adds to its base is computed at `Effort.paint_scale`, from means over the sides' cells. A
+        refinement of geometric forecasts leaves the base as it is.
         """
         render = self.config.render
+        if self.refine.of_forecast:
+            return self.refine.base_of([looks_of(side, render.normalised) for side in sides])
         height, width = sides[0].coverage.shape[2:]
         size = fraction(height, width, self.effort.paint_scale)
         if size != (height, width) and self.refine.base == "none":
@@ -252,6 +255,18 @@ class Stages(nn.Module):
         base = self.refine.base_of([looks_of(side, render.normalised) for side in sides])
         image = base + enlarged(added, height, width)
         return image if self.training else image.clamp(0, 1)
+
+    @timed
+    def retouch(self, planes: torch.Tensor) -> torch.Tensor:
+        """What refinement adds to the image of a geometric forecast, [B, 3, H, W]; at `Effort.paint_scale` as `paint`.
+
+        Args:
+            planes: [B, FORECAST_PLANES, H, W], of `vestcl.forecast_planes`.
+        """
+        height, width = planes.shape[2:]
+        with self._autocast():
+            painted = self.refine.painted(reduced(planes, *fraction(height, width, self.effort.paint_scale)))
+        return self.refine.change(planes, enlarged(painted.to(planes.dtype), height, width))
 
     def _splat(
         self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor, size: tuple[int, int]

@@ -55,6 +55,12 @@ LEAST_COVERAGE: Final = 0.1
 #: From this coverage on a side hides what is behind it: only cracks between a surface's points let it through.
 OPAQUE: Final = 0.5
 
+#: Planes that refinement of geometric forecasts is shown: `vestcl.forecast_planes`.
+FORECAST_PLANES: Final = 7
+
+#: The most that it changes a colour by, of 1, where a pixel is covered; where nothing covers it, by 1.
+MOST_CHANGE: Final = 0.25
+
 #: The same as RHO where colour is shown directly, and refinement only adds to it (SPEC section 2).
 RHO_DIRECT: Final = 0.95
 
@@ -190,10 +196,17 @@ class RefineConfig:
     base: Literal["none", "splatted", "filled"] = "none"
     """What refinement adds to: coverage x splatted colour; or that colour divided by coverage and, where nothing
     covers, filled from what surrounds it. "none" paints the image through a sigmoid."""
+    refines: Literal["clouds", "forecast"] = "clouds"
+    """"clouds": the splatted clouds, features among them. "forecast": planes of a geometric forecast
+    (`vestcl.forecast_planes`), whose image it adds to; the network's own forecast is then its base, unrefined."""
 
     def __post_init__(self) -> None:
         if self.base not in ("none", "splatted", "filled"):
             raise ValueError(f'`base` must be "none", "splatted" or "filled", got {self.base!r}')
+        if self.refines not in ("clouds", "forecast"):
+            raise ValueError(f'`refines` must be "clouds" or "forecast", got {self.refines!r}')
+        if self.refines == "forecast" and self.base == "none":
+            raise ValueError('`base` must not be "none" with `refines` "forecast": that adds to an image')
 
 
 @dataclass(frozen=True)

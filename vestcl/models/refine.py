@@ -8,7 +8,15 @@ from torch import nn
 from torch.nn import functional
 
 from vestcl.models._layers import channels_last, check, group_norm, side_by_side, upsample
-from vestcl.models.config import LEAST_COVERAGE, OPAQUE, REFINE_GROUP, RefineConfig, RenderConfig
+from vestcl.models.config import (
+    FORECAST_PLANES,
+    LEAST_COVERAGE,
+    MOST_CHANGE,
+    OPAQUE,
+    REFINE_GROUP,
+    RefineConfig,
+    RenderConfig,
+)
 
 
 class Refine(nn.Module):
@@ -23,6 +31,9 @@ class Refine(nn.Module):
     previous frame, b = c_cur + (1 - coverage_cur) c_prev. "filled" takes colours divided by coverage, opaque from
     OPAQUE on, the current frame over the previous one, and `fill`s what is left.
 
+    Of a geometric forecast (`RefineConfig.refines`) it takes `vestcl.forecast_planes`, image I and coverage c among
+    them, and gives I + m(c) tanh(y): m is MOST_CHANGE from coverage OPAQUE on, and 1 where nothing is covered.
+
     Source: SPEC section 6; 3D Moments (CVPR 2022). There, four max-pools face five doublings, and the first doubled
     image is cut to its middle to fit; here the bottleneck has a max-pool of its own.
     """
@@ -35,7 +46,8 @@ class Refine(nn.Module):
         if config.base != "none" and not self.render.colour:
             raise ValueError("`config.base` adds to the rendered colour, so it needs `render.colour`")
         self.base = config.base
-        self.channels = self.render.channels(features)
+        self.of_forecast = config.refines == "forecast"
+        self.channels = FORECAST_PLANES if self.of_forecast else self.render.channels(features)
         kernel, widths = config.stem_kernel, (config.stem, *config.widths)
         self.stem = nn.Sequential(
             nn.Conv2d(self.channels, config.stem, kernel, padding=kernel // 2, bias=False), nn.PReLU()
@@ -54,7 +66,7 @@ class Refine(nn.Module):
         Args:
             rendered: [B, channels, H, W] of any size: for the previous frame's cloud and then the current one's (or
                 once, for both together) the features and, if colour is rendered, colour 3, coverage 1 and inverse
-                depth 1, as `RenderConfig.channels` counts them.
+                depth 1, as `RenderConfig.channels` counts them. Or the planes of a geometric forecast.
 
         Returns:
             image [B, 3, H, W]; differentiable.
@@ -62,11 +74,25 @@ class Refine(nn.Module):
         Raises:
             ValueError: ``rendered`` is not floating point [B, channels, H, W].
         """
+        if self.of_forecast:
+            image = rendered[:, :3] + self.change(rendered)
+            return image if self.training else image.clamp(0, 1)
         y = self.painted(rendered)
         if self.base == "none":
             return y.sigmoid()
         image = self.base_image(rendered) + y
         return image if self.training else image.clamp(0, 1)
+
+    def change(self, planes: torch.Tensor, painted: torch.Tensor | None = None) -> torch.Tensor:
+        """m(c) tanh(y) of the class's formula, [B, 3, H, W].
+
+        Args:
+            planes: [B, FORECAST_PLANES, H, W] of a geometric forecast.
+            painted: y [B, 3, H, W]; None is `painted` of the planes.
+        """
+        y = self.painted(planes) if painted is None else painted
+        covered = (planes[:, 3:4] / OPAQUE).clamp(0, 1)
+        return (1 - (1 - MOST_CHANGE) * covered) * y.tanh()
 
     def painted(self, rendered: torch.Tensor) -> torch.Tensor:
         """y of the class's formula, [B, 3, H, W]; arguments and errors as of `forward`."""

@@ -1,0 +1,354 @@
+"""Train the refinement of geometric forecasts: ``python -m train.refinement train/configs/refinement/street.yaml``.
+
+It learns on what `train.forecasts` kept, which is what it sees at inference, and starts from changing nothing. Out come
+``vest.safetensors``, a model whose refinement is the EMA weights and whose other parts are those of ``model``,
+``log.jsonl``, and ``state.pt`` to resume from.
+"""
+
+import dataclasses
+import json
+import math
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Final, cast
+
+import numpy as np
+import torch
+import tyro
+from pydantic import Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+from rich.console import Console
+from torch import nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from train._settings import in_words, read_settings
+from train.augment import draw_colour, mean_luma
+from train.command import ERRORS, failed
+from train.config import RULES, Count, CountOrNone, LossConfig, OptimiserConfig, RunConfig, Share, Stage
+from train.forecasts import unpack
+from train.losses import Perceptual, build_perceptual, image_terms
+from train.trainer import learning_rate_factor
+from vestcl import interrupt
+from vestcl.io import atomic
+from vestcl.models._checkpoint import read_trained_on, write_checkpoint
+from vestcl.models.config import ModelConfig, RefineConfig
+from vestcl.models.forecaster import Forecaster
+from vestcl.models.refine import Refine
+from vestcl.pretrained import find_model, load_model
+
+#: Files of a run.
+WEIGHTS: Final = "vest.safetensors"
+STATE: Final = "state.pt"
+LOG: Final = "log.jsonl"
+
+#: Luma of RGB (ITU-R BT.601).
+_LUMA: Final = np.array([0.299, 0.587, 0.114], np.float32)
+
+
+@dataclass(frozen=True, config=RULES)
+class ForecastData:
+    """What is shown, and how it is varied."""
+
+    train: tuple[str, ...]
+    """Folders of a cache of `train.forecasts`, one a clip; the last part may be a pattern ("cache/street_3*")."""
+    crop: tuple[Count, Count] | None = None
+    """(height, width) px of a part drawn at random; null shows whole images."""
+    flip: bool = True
+    """Mirror every other sample."""
+    colour: Share = 0.2
+    """Strength of the change of brightness, contrast, gamma, saturation and hue."""
+    grey: Share = 0.2
+    """Probability that a sample is grey."""
+
+    def __post_init__(self) -> None:
+        if not self.train:
+            raise ValueError("`train` must name a folder or more, got none")
+
+
+@dataclass(frozen=True, config=RULES)
+class RefinementConfig:
+    """A run. Of `Stage`, steps, batch and learning rate count; of `RunConfig`, all but ``keep`` and ``image_every``."""
+
+    name: Annotated[str, Field(min_length=1)]
+    """Of the model that is written."""
+    out: Path
+    data: ForecastData
+    stage: Stage
+    loss: LossConfig
+    """The terms of images."""
+    model: str = "vest-s"
+    """The model whose other parts are kept, as `vestcl forecast --model` takes it. If its refinement refines geometric
+    forecasts already, that is where training starts."""
+    seed: CountOrNone = 0
+    optimiser: OptimiserConfig = OptimiserConfig()
+    run: RunConfig = RunConfig()
+
+
+def load_config(path: Path | str, overrides: Sequence[str] = ()) -> RefinementConfig:
+    """As `train.config.load_config`, for a refinement.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: everything that is wrong, in one message.
+    """
+    try:
+        return _ADAPTER.validate_python(read_settings(path, overrides))
+    except ValidationError as error:
+        raise ValueError(in_words(error, RefinementConfig, str(path))) from error
+
+
+# ---------------------------------------------------------------- data
+
+
+class Samples:
+    """Samples drawn from a cache: each is a function of the seed, the step and its place in the batch.
+
+    Args:
+        data: which folders.
+        seed: of the run.
+
+    Raises:
+        ValueError: no windows there.
+    """
+
+    def __init__(self, data: ForecastData, seed: int) -> None:
+        self.data, self.seed = data, seed
+        self.files = sorted({file for pattern in data.train for file in _files(Path(pattern))})
+        if not self.files:
+            raise ValueError(f"`data.train` must hold windows of `train.forecasts`, got none in {list(data.train)}")
+
+    def batch(self, step: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Planes [B, FORECAST_PLANES, H, W] and true images [B, 3, H, W] of an update.
+
+        Raises:
+            ValueError: a window's file is damaged, or smaller than the crop.
+        """
+        drawn = [self._sample(step * size + place) for place in range(size)]
+        planes, targets = (torch.from_numpy(np.stack(part)) for part in zip(*drawn, strict=True))
+        return planes, targets
+
+    def _sample(self, number: int) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+        """Every file once an epoch, in an order of its own; one of its entries, varied."""
+        epoch, place = divmod(number, len(self.files))
+        file = self.files[np.random.default_rng([self.seed, epoch]).permutation(len(self.files))[place]]
+        rng = np.random.default_rng([self.seed, 1, number])
+        entry = unpack(file, lambda entries: [int(rng.integers(entries))]).entries[0]
+        planes, target = self._cut(file, np.concatenate([entry.planes, entry.target]), rng)
+        change = draw_colour(rng, self.data.colour, mean_luma(target))
+        planes[:3], target = change(planes[:3]), change(target)
+        if rng.random() < self.data.grey:
+            planes[:3], target = (np.tensordot(_LUMA, image, 1)[None].repeat(3, 0) for image in (planes[:3], target))
+        return planes, target
+
+    def _cut(
+        self, file: Path, both: np.ndarray[Any, Any], rng: np.random.Generator
+    ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+        """Planes and target of a part of the window, mirrored or not."""
+        rows, columns = both.shape[1:]
+        height, width = self.data.crop or (rows, columns)
+        if height > rows or width > columns:
+            raise ValueError(f"`data.crop` must be at most {rows}x{columns}, of {file}, got {height}x{width}")
+        top, left = int(rng.integers(rows - height + 1)), int(rng.integers(columns - width + 1))
+        both = both[:, top : top + height, left : left + width]
+        if self.data.flip and rng.random() < 0.5:
+            both = both[:, :, ::-1]
+        return both[:-3].copy(), both[-3:].copy()
+
+    def shown(self) -> dict[str, tuple[int, int]]:
+        """By clip, the first and the last frame of its windows."""
+        found: dict[str, tuple[int, int]] = {}
+        for file in self.files:
+            clip, current, ahead = _about(file)
+            found[clip] = (0, max(current + ahead, found.get(clip, (0, 0))[1]))
+        return found
+
+
+def _about(file: Path) -> tuple[str, int, int]:
+    """The clip, the frame t, and the longest horizon."""
+    with np.load(file, allow_pickle=False) as arrays:
+        return str(arrays["clip"]), int(arrays["current"]), int(arrays["ahead"].max())
+
+
+def _files(pattern: Path) -> list[Path]:
+    folders = sorted(pattern.parent.glob(pattern.name)) if "*" in pattern.name else [pattern]
+    return [file for folder in folders for file in [*folder.glob("*.npz"), *folder.glob("*/*.npz")]]
+
+
+# ---------------------------------------------------------------- model
+
+
+def with_forecast_refinement(model: Forecaster, name: str) -> Forecaster:
+    """``model`` with a refinement of geometric forecasts in place of its own, of the same sizes; it changes nothing.
+
+    A model that has one keeps it.
+
+    Args:
+        model: any network with a base to add to.
+        name: of the result.
+
+    Raises:
+        ValueError: the model predicts RGB directly.
+    """
+    config, state = dataclasses.replace(model.config, name=name), dict(model.state_dict())
+    if not model.refine.of_forecast:
+        refine = RefineConfig(**(dataclasses.asdict(config.refine) | {"refines": "forecast"}))
+        config = dataclasses.replace(config, refine=refine)
+        fresh = Forecaster(config).refine.state_dict()
+        state = {key: value for key, value in state.items() if not key.startswith("refine.")}
+        state |= {f"refine.{key}": value for key, value in fresh.items()}
+    made = Forecaster(config)
+    made.load_state_dict(state)
+    return made
+
+
+# ---------------------------------------------------------------- run
+
+
+class Training:
+    """The refinement, its EMA weights and what is known of the run."""
+
+    def __init__(self, config: RefinementConfig, base: Forecaster) -> None:
+        torch.manual_seed(config.seed)
+        self.config, self.console = config, Console()
+        self.whole = with_forecast_refinement(base, config.name)
+        self.refine: Refine = self.whole.refine.train()
+        self.average = AveragedModel(self.refine, multi_avg_fn=get_ema_multi_avg_fn(config.optimiser.ema))
+        self.samples = Samples(config.data, config.seed)
+        self.trained_on = _joined(read_trained_on(find_model(config.model)) or {}, self.samples.shown())
+        self.perceptual: Perceptual | None = build_perceptual(config.loss)
+        decay, stage = config.optimiser.weight_decay, config.stage
+        betas, learning = config.optimiser.betas, self.refine.parameters()
+        self.adam = torch.optim.AdamW(learning, stage.learning_rate, betas, weight_decay=decay)
+        self.step = 0
+
+    def restore(self) -> None:
+        """Resume from the run's last state, if there is one."""
+        path = self.config.out / STATE
+        if path.is_file():
+            state = torch.load(path, weights_only=True)
+            self.refine.load_state_dict(state["refine"])
+            self.average.load_state_dict(state["average"])
+            self.adam.load_state_dict(state["adam"])
+            self.step = state["step"]
+
+    def go(self) -> None:
+        """To the last step.
+
+        Raises:
+            ValueError: data that can't be used, or a loss that is not finite.
+        """
+        stage, run = self.config.stage, self.config.run
+        for step in range(self.step, stage.steps):
+            start = time.perf_counter()
+            planes, target = self.samples.batch(step, stage.batch)
+            read = time.perf_counter() - start
+            row = self._update(planes, target)
+            self.step = step + 1
+            row |= {"s_data": read, "s_network": time.perf_counter() - start - read}
+            if self.step % run.log_every == 0 or self.step == stage.steps:
+                self._log(row)
+            if self.step % run.checkpoint_every == 0 or self.step == stage.steps:
+                self._save()
+
+    def _update(self, planes: torch.Tensor, target: torch.Tensor) -> dict[str, float]:
+        config, stage = self.config, self.config.stage
+        rate = stage.learning_rate * learning_rate_factor(self.step, stage, config.optimiser.final_factor)
+        self.adam.param_groups[0]["lr"] = rate
+        self.adam.zero_grad(set_to_none=True)
+        with torch.autocast("cpu", torch.bfloat16, enabled=config.run.precision == "bfloat16"):
+            image = self.refine(planes)
+        terms = image_terms(image.float(), target, config.loss, self.perceptual)
+        total = torch.stack([weight * term for weight, term in terms.values()]).sum()
+        total.backward()
+        norm = nn.utils.clip_grad_norm_(self.refine.parameters(), config.optimiser.clip_norm or math.inf)
+        if math.isfinite(total.item()) and math.isfinite(norm.item()):
+            self.adam.step()
+            self.average.update_parameters(self.refine)
+        elif config.run.on_nan == "stop":
+            raise ValueError(f"step {self.step + 1}: non-finite loss or gradient")
+        before = {"l1_geometric": (planes[:, :3] - target).abs().mean().item()}
+        each = {name: term.item() for name, (_, term) in terms.items()}
+        return {"loss": total.item(), **each, **before, "gradient": norm.item(), "rate": rate}
+
+    def _log(self, row: Mapping[str, float]) -> None:
+        with (self.config.out / LOG).open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"step": self.step, **row}) + "\n")
+        shown = ", ".join(f"{name} {value:.4g}" for name, value in row.items())
+        self.console.print(f"step {self.step}: {shown}", highlight=False, soft_wrap=True)
+
+    def model(self) -> tuple[ModelConfig, dict[str, torch.Tensor]]:
+        """The whole model with the EMA weights."""
+        mean = cast(Refine, self.average.module).state_dict()
+        state = dict(self.whole.state_dict()) | {f"refine.{name}": value for name, value in mean.items()}
+        return self.whole.config, state
+
+    def _save(self) -> None:
+        write_checkpoint(self.config.out / WEIGHTS, *self.model(), self.trained_on)
+        state = {"refine": self.refine.state_dict(), "average": self.average.state_dict()}
+        with atomic.replacing(self.config.out / STATE) as temporary:
+            torch.save(state | {"adam": self.adam.state_dict(), "step": self.step}, temporary)
+
+
+def _joined(one: Mapping[str, tuple[int, int]], two: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
+    """By clip, the first and the last frame of either."""
+    both = {clip: [frames[clip] for frames in (one, two) if clip in frames] for clip in {**one, **two}}
+    return {clip: (min(a for a, _ in frames), max(b for _, b in frames)) for clip, frames in both.items()}
+
+
+def train(config: RefinementConfig, *, resume: bool = False, base: Forecaster | None = None) -> Path:
+    """Train to the last step.
+
+    Args:
+        config: of the run.
+        resume: from the last state in ``config.out``, if there is one.
+        base: in place of the model that ``config.model`` names.
+
+    Returns:
+        The model's file.
+
+    Raises:
+        ValueError: data or weights that can't be used, a run that exists already, or a non-finite loss.
+        FileNotFoundError: no classifier's weights for the perceptual loss.
+    """
+    if not resume and (config.out / STATE).exists():
+        raise ValueError(f"`out` {config.out} has a run already: --resume resumes it, or take another folder")
+    if config.run.threads:
+        torch.set_num_threads(config.run.threads)
+    training = Training(config, base or load_model(config.model))
+    config.out.mkdir(parents=True, exist_ok=True)
+    if resume:
+        training.restore()
+    training.go()
+    return config.out / WEIGHTS
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Train the refinement of geometric forecasts as a configuration says."""
+
+    config: tyro.conf.Positional[Path]
+    """YAML file."""
+    overrides: tyro.conf.Positional[tuple[str, ...]] = ()
+    """key=value or key.sub=value each; values are YAML."""
+    resume: bool = False
+    """Resume the run from its last state, if it has one."""
+
+
+@interrupt.command
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; its exit status."""
+    options = tyro.cli(Options, args=arguments, description=__doc__, prog="python -m train.refinement")
+    try:
+        file = train(load_config(options.config, options.overrides), resume=options.resume)
+    except ERRORS as error:
+        return failed(error)
+    Console().print(str(file), highlight=False, markup=False, soft_wrap=True)
+    return 0
+
+
+_ADAPTER: Final = TypeAdapter(RefinementConfig)
+
+if __name__ == "__main__":
+    sys.exit(main())
