@@ -11,9 +11,10 @@ import torch
 import yaml
 from forecaster_scenes import SMALL
 
-from train import forecasts, refinement, refinement_scores
+from train import forecasts, refinement, refinement_scores, trainer
 from train.forecasts import Entry, Window, pack, unpack
 from train.refinement import LOG, STATE, RefinementConfig, Samples, load_config, train, with_forecast_refinement
+from vestcl.data import Street
 from vestcl.forecast import View
 from vestcl.forecast_planes import forecast_planes
 from vestcl.geometric import Perception, forecast_frames
@@ -81,6 +82,13 @@ def test_the_cache_is_the_same_again_and_keeps_what_is_there(cache: Path, tmp_pa
     assert make(tmp_path, "--right") == 0
     assert "1 windows made, 1 kept" in capsys.readouterr().out
     assert (tmp_path / files[0]).read_bytes() == (cache / files[0]).read_bytes()
+
+
+def test_clips_are_forecast_and_compared_at_the_size_asked_for() -> None:
+    clip = Street.generate(3).clip(4, 60, 120).resized(48, 96)
+    made = forecasts.entries(Perception(clip), clip, 2, [1], right=True)
+    assert [entry.target.shape for entry in made] == [(3, 48, 96)] * 2
+    np.testing.assert_array_equal(made[0].target, clip[3].read_image())
 
 
 def test_a_shard_has_its_clips(tmp_path: Path) -> None:
@@ -180,6 +188,28 @@ def test_a_model_that_refines_forecasts_keeps_its_refinement() -> None:
     torch.nn.init.normal_(once.refine.out.weight)
     again = with_forecast_refinement(once, "two")
     assert again.config.name == "two" and torch.equal(again.refine.out.weight, once.refine.out.weight)
+
+
+def test_a_run_starts_from_another_models_refinement(tmp_path: Path, cache: Path) -> None:
+    once = with_forecast_refinement(base(), "one")
+    torch.nn.init.normal_(once.refine.out.weight)
+    once.save(tmp_path / "one.safetensors")
+    config = settings(tmp_path, cache, f"init={tmp_path / 'one.safetensors'}")
+    started = refinement.Training(config, base())
+    assert torch.equal(started.whole.refine.out.weight, once.refine.out.weight)
+    base().save(tmp_path / "clouds.safetensors")
+    with pytest.raises(ValueError, match="its refinement is of splatted clouds"):
+        refinement.Training(dataclasses.replace(config, init=str(tmp_path / "clouds.safetensors")), base())
+
+
+def test_other_parts_train_on_from_such_a_model(tmp_path: Path) -> None:
+    """`train.fit` takes all parts of it but refinement, which it trains on splatted clouds."""
+    with_forecast_refinement(base(), "one").save(tmp_path / "one.safetensors")
+    given = Forecaster.load(tmp_path / "one.safetensors")
+    state = trainer._fitting(given, base())
+    base().load_state_dict(state)
+    others = [name for name in state if not name.startswith("refine.")]
+    assert others and all(torch.equal(state[name], given.state_dict()[name]) for name in others)
 
 
 def test_the_shipped_configuration_is_complete() -> None:

@@ -59,9 +59,14 @@ def about_model(weights: Weights) -> str:
     start = _START[config.start] + _camera(config)
     words = (
         f"`{weights.name}`, configuration `{config.name}`: motion starts from {start}, refinement adds "
-        f"to {_BASE[config.refine.base]}. CONVENTIONS.md explains the words, `vestcl/models/config.py` has all sizes."
+        f"to {_base(config)}. CONVENTIONS.md explains the words, `vestcl/models/config.py` has all sizes."
     )
     return f"{words}\n\n{to_markdown(grid)}".rstrip()
+
+
+def _base(config: ModelConfig) -> str:
+    """What refinement adds to."""
+    return "the geometric forecast's image" if config.refine.refines == "forecast" else _BASE[config.refine.base]
 
 
 def _camera(config: ModelConfig) -> str:

@@ -148,7 +148,7 @@ def entries(perception: Perception, truth: Clip, index: int, horizons: Sequence[
             source = later.right if view.name == "right" else later
             if source is not None:
                 planes = forecast_planes(made.frames[ahead - 1][view.name], ahead, truth.interval)
-                found.append(Entry(planes, source.image.read(), ahead))
+                found.append(Entry(planes, source.read_image(), ahead))
     return found
 
 

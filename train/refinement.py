@@ -79,8 +79,10 @@ class RefinementConfig:
     loss: LossConfig
     """The terms of images."""
     model: str = "vest-s"
-    """The model whose other parts are kept, as `vestcl forecast --model` takes it. If its refinement refines geometric
-    forecasts already, that is where training starts."""
+    """The model whose other parts are kept, as `vestcl forecast --model` takes it."""
+    init: str | None = None
+    """A model, named likewise, whose refinement of geometric forecasts training starts from; null starts from that of
+    ``model``, if it is of geometric forecasts, or else from one that changes nothing."""
     seed: CountOrNone = 0
     optimiser: OptimiserConfig = OptimiserConfig()
     run: RunConfig = RunConfig()
@@ -158,11 +160,7 @@ class Samples:
 
     def shown(self) -> dict[str, tuple[int, int]]:
         """By clip, the first and the last frame of its windows."""
-        found: dict[str, tuple[int, int]] = {}
-        for file in self.files:
-            clip, current, ahead = _about(file)
-            found[clip] = (0, max(current + ahead, found.get(clip, (0, 0))[1]))
-        return found
+        return _joined(*({clip: (0, current + ahead)} for clip, current, ahead in map(_about, self.files)))
 
 
 def _about(file: Path) -> tuple[str, int, int]:
@@ -213,15 +211,27 @@ class Training:
         torch.manual_seed(config.seed)
         self.config, self.console = config, Console()
         self.whole = with_forecast_refinement(base, config.name)
+        if config.init is not None:
+            self._start_from(config.init)
         self.refine: Refine = self.whole.refine.train()
         self.average = AveragedModel(self.refine, multi_avg_fn=get_ema_multi_avg_fn(config.optimiser.ema))
         self.samples = Samples(config.data, config.seed)
-        self.trained_on = _joined(read_trained_on(find_model(config.model)) or {}, self.samples.shown())
+        shown = [read_trained_on(find_model(name)) or {} for name in (config.model, config.init or config.model)]
+        self.trained_on = _joined(*shown, self.samples.shown())
         self.perceptual: Perceptual | None = build_perceptual(config.loss)
         decay, stage = config.optimiser.weight_decay, config.stage
         betas, learning = config.optimiser.betas, self.refine.parameters()
         self.adam = torch.optim.AdamW(learning, stage.learning_rate, betas, weight_decay=decay)
         self.step = 0
+
+    def _start_from(self, name: str) -> None:
+        given = load_model(name)
+        try:
+            if not given.refine.of_forecast:
+                raise RuntimeError("its refinement is of splatted clouds")
+            self.whole.refine.load_state_dict(given.refine.state_dict())
+        except RuntimeError as error:
+            raise ValueError(f"`init` must have a refinement of forecasts that fits, got {name} ({error})") from error
 
     def restore(self) -> None:
         """Resume from the run's last state, if there is one."""
@@ -291,10 +301,13 @@ class Training:
             torch.save(state | {"adam": self.adam.state_dict(), "step": self.step}, temporary)
 
 
-def _joined(one: Mapping[str, tuple[int, int]], two: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
-    """By clip, the first and the last frame of either."""
-    both = {clip: [frames[clip] for frames in (one, two) if clip in frames] for clip in {**one, **two}}
-    return {clip: (min(a for a, _ in frames), max(b for _, b in frames)) for clip, frames in both.items()}
+def _joined(*shown: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
+    """By clip, the first and the last frame of all."""
+    found: dict[str, tuple[int, int]] = {}
+    for clip, (first, last) in (item for each in shown for item in each.items()):
+        before = found.get(clip, (first, last))
+        found[clip] = (min(first, before[0]), max(last, before[1]))
+    return found
 
 
 def train(config: RefinementConfig, *, resume: bool = False, base: Forecaster | None = None) -> Path:

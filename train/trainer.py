@@ -69,13 +69,16 @@ _HEADS: Final = tuple(f"ego_motion.{name}." for name in ("shown", "swayed", "mot
 
 
 def _fitting(given: Forecaster, model: Forecaster) -> dict[str, torch.Tensor]:
-    """The weights of ``given``; where its EMF corrects a prior in another way, EMF's last layers are ``model``'s."""
+    """The weights of ``given``; where its EMF corrects a prior in another way, EMF's last layers are ``model``'s, and
+    so is refinement where one is of geometric forecasts and the other is not."""
     pair = given.config.ego_motion, model.config.ego_motion
-    state = given.state_dict()
-    if None in pair or len({getattr(each, "correction", None) for each in pair}) == 1:
-        return state
-    kept = {name: tensor for name, tensor in state.items() if not name.startswith(_HEADS)}
-    return kept | {name: tensor for name, tensor in model.state_dict().items() if name.startswith(_HEADS)}
+    other: tuple[str, ...] = ()
+    if None not in pair and len({getattr(each, "correction", None) for each in pair}) > 1:
+        other += _HEADS
+    if given.config.refine.refines != model.config.refine.refines:
+        other += ("refine.",)
+    kept = {name: tensor for name, tensor in given.state_dict().items() if not name.startswith(other)}
+    return kept | {name: tensor for name, tensor in model.state_dict().items() if name.startswith(other)}
 
 
 def model_config(config: Config) -> ModelConfig:
