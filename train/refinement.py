@@ -258,7 +258,7 @@ class Training:
             self.step = step + 1
             row |= {"s_data": read, "s_network": time.perf_counter() - start - read}
             if self.step % run.log_every == 0 or self.step == stage.steps:
-                self._log(row)
+                self._log(row | self._geometric(planes, target))
             if self.step % run.checkpoint_every == 0 or self.step == stage.steps:
                 self._save()
 
@@ -278,9 +278,14 @@ class Training:
             self.average.update_parameters(self.refine)
         elif config.run.on_nan == "stop":
             raise ValueError(f"step {self.step + 1}: non-finite loss or gradient")
-        before = {"l1_geometric": (planes[:, :3] - target).abs().mean().item()}
         each = {name: term.item() for name, (_, term) in terms.items()}
-        return {"loss": total.item(), **each, **before, "gradient": norm.item(), "rate": rate}
+        return {"loss": total.item(), **each, "gradient": norm.item(), "rate": rate}
+
+    def _geometric(self, planes: torch.Tensor, target: torch.Tensor) -> dict[str, float]:
+        """The terms of the forecasts as they are."""
+        with torch.no_grad():
+            terms = image_terms(planes[:, :3], target, self.config.loss, self.perceptual)
+        return {f"{name}_geometric": term.item() for name, (_, term) in terms.items()}
 
     def _log(self, row: Mapping[str, float]) -> None:
         with (self.config.out / LOG).open("a", encoding="utf-8") as file:
