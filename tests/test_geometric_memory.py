@@ -14,7 +14,7 @@ from vestcl.forecast import Forecast, View
 from vestcl.geometric import memory
 from vestcl.geometric.forecast import _static, forecast_frames
 from vestcl.geometric.memory import Memory, remember
-from vestcl.geometric.perception import Perception
+from vestcl.geometric.perception import Perception, Surface
 from vestcl.geometric.render import HOLE, Shown, holes, show
 
 NOW, DISTANCE = 6, 20.0
@@ -43,6 +43,10 @@ class Turning:
             mask[where], depth[where] = False, 8.0
             image[where] = np.array([1, 0, 0], np.float32)[:, None, None]
         return SimpleNamespace(layers=SimpleNamespace(image=image, depth=depth, mask=mask), own=np.zeros_like(mask))
+
+    def surface(self, index: int) -> Surface:
+        seen = self.seen(index)
+        return Surface(seen.layers.image, seen.layers.depth, seen.layers.mask, seen.own)
 
     def prev_from_cur(self, index: int) -> Matrix:
         return turned(TURN, 0, 0, (0, 0, 0))

@@ -16,7 +16,8 @@ from geometric_scenes import HEIGHT, WIDTH, drive
 
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DepthArray, DepthFile, ImageArray
-from vestcl.geometric.forecast import input_notes
+from vestcl.forecast import View
+from vestcl.geometric.forecast import forecast_frames, input_notes
 from vestcl.geometric.perception import Perception
 from vestcl.scene.layers import SKY_DEPTH
 
@@ -186,6 +187,25 @@ def test_everything_is_computed_once() -> None:
     assert Counter(stages) == {"layers": 1, "mask": 1, "depth": 2, "flow": 1, "read": 2, "ego-motion": 1}
     perception.seen(FRAME + 1)
     assert counts[f"image {FRAME}"] == counts[f"depth {FRAME}"] == 1
+
+
+def test_a_forecast_inpaints_only_the_current_frame() -> None:
+    """Earlier frames are shown as they were seen; their `surface` and `moving` are parts of what `seen` finds."""
+    filled: list[np.ndarray] = []
+
+    def fill(colour: np.ndarray, hole: np.ndarray, road: np.ndarray) -> np.ndarray:
+        filled.append(colour)
+        return colour
+
+    clip = drive(4, frames=8).clip
+    perception = Perception(clip, inpaint=fill)
+    forecast_frames(perception, 6, 1, [View("source", np.eye(4))])
+    assert len(filled) == 1 and np.array_equal(filled[0], perception.image(6))
+    whole, parts = Perception(clip).seen(5), Perception(clip)
+    surface, moving = parts.surface(5), parts.moving(5)
+    for name in ("image", "depth", "mask"):
+        assert np.array_equal(getattr(surface, name), getattr(whole.layers, name))
+    assert np.array_equal(moving.velocity, whole.velocity) and np.array_equal(moving.things, whole.things)
 
 
 @dataclass(frozen=True)

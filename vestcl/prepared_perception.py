@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.geometric import objects
-from vestcl.geometric.perception import Perception, Seen
+from vestcl.geometric.perception import Moving, Perception, Seen, Surface
 from vestcl.prepared import Prepared, PreparedClip
 from vestcl.scene.inpainters import Inpainter
 
@@ -130,6 +130,16 @@ class PreparedPerception(Perception):
     def seen(self, index: int) -> Seen:
         """The frame's layers and objects."""
         return self.once("layers", index, lambda: self._seen(index))
+
+    def surface(self, index: int) -> Surface:
+        """What the frame shows."""
+        frame = self._frame_of(index)
+        return Surface(frame.layers.image, frame.layers.depth, frame.layers.mask, frame.own)
+
+    def moving(self, index: int) -> Moving:
+        """The frame's objects."""
+        seen = self.seen(index)
+        return Moving(seen.things, seen.velocity)
 
     def _seen(self, index: int) -> Seen:
         frame = self._frame_of(index)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -168,13 +169,14 @@ MovingCloud = Callable[[int, list[NDArray[np.float64]]], Cloud]
 def _clouds(perception: Perception, index: int, paths: Paths, memory: Memory | None = None) -> list[MovingCloud]:
     """What the current frame shows; what the one before did; what is remembered; what is behind the foreground."""
     K = perception.clip[index].K
-    cur, prev = perception.seen(index), perception.seen(index - 1)
+    cur, prev = perception.seen(index), perception.surface(index - 1)
     cur_from_prev = np.asarray(np.linalg.inv(perception.prev_from_cur(index)), np.float64)
     shown = _shown(paths, cur.own)
     since = cur_from_prev, perception.clip.elapsed(index)
-    image_prev = as_exposed(prev.layers.image, cur.layers.image, perception.correspondence(index).flow_uv)
+    image_prev = as_exposed(prev.image, cur.layers.image, perception.correspondence(index).flow_uv)
     scale = np.float32(perception.scale_before(index))
-    before = _cloud(image_prev, scale * prev.layers.depth, ~prev.own, K, scale * prev.velocity, *since)
+    velocity = scale * perception.moving(index - 1).velocity
+    before = _cloud(image_prev, scale * prev.depth, ~prev.own, K, velocity, *since)
     hidden = ~cur.layers.mask & ~cur.own
     behind = _cloud(cur.layers.background_image, cur.layers.background_depth, hidden, K)
     return [shown, before, *([] if memory is None else [_static(memory)]), behind]
@@ -189,7 +191,7 @@ def _shown(paths: Paths, own: NDArray[np.bool_]) -> MovingCloud:
     def points_at(step: int, future_from_cur: list[NDArray[np.float64]]) -> NDArray[np.float32]:
         if step not in points:
             moved = np.where(own, now, paths.at(step, future_from_cur[step]))
-            points[step] = np.ascontiguousarray(moved.reshape(3, -1).T, np.float32)
+            points[step] = np.asarray(cv2.transpose(moved.astype(np.float32).reshape(3, -1)))
         return points[step]
 
     def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
@@ -221,9 +223,27 @@ def _cloud(
         speed = speed @ cur_from_src[:3, :3].T
     z_src = z.astype(np.float32)
 
+    moved = _kept_steps(lambda k, future_from_cur: _transform(future_from_cur, points + k * speed))
+
     def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
-        there, before = (_transform(future_from_cur[k], points + k * speed) for k in (step, step - 1))
+        there, before = (moved(k, future_from_cur[k]) for k in (step, step - 1))
         return Cloud(there.astype(np.float32), z_src, image, (there - before).astype(np.float32), y, x)
+
+    return at
+
+
+def _kept_steps(
+    moved: Callable[[int, NDArray[np.float64]], NDArray[np.float64]],
+) -> Callable[[int, NDArray[np.float64]], NDArray[np.float64]]:
+    """``moved`` that keeps its last two results: a step's points are the next one's points before."""
+    kept: dict[int, NDArray[np.float64]] = {}
+
+    def at(step: int, future_from_cur: NDArray[np.float64]) -> NDArray[np.float64]:
+        if step not in kept:
+            for earlier in [k for k in kept if k < step - 1]:
+                del kept[earlier]
+            kept[step] = moved(step, future_from_cur)
+        return kept[step]
 
     return at
 
@@ -231,8 +251,10 @@ def _cloud(
 def _static(memory: Memory) -> MovingCloud:
     """What is remembered, at rest in the world."""
 
+    moved = _kept_steps(lambda k, future_from_cur: _transform(future_from_cur, memory.points_xyz))
+
     def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
-        there, before = (_transform(future_from_cur[k], memory.points_xyz) for k in (step, step - 1))
+        there, before = (moved(k, future_from_cur[k]) for k in (step, step - 1))
         seen_at = memory.z_src, memory.image
         return Cloud(
             there.astype(np.float32), *seen_at, (there - before).astype(np.float32), memory.rows, memory.columns
@@ -242,7 +264,10 @@ def _static(memory: Memory) -> MovingCloud:
 
 
 def _transform(dst_from_src: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    return points @ dst_from_src[:3, :3].T + dst_from_src[:3, 3]
+    """[N, 3]: R x + t."""
+    if not len(points):
+        return points
+    return np.asarray(cv2.transform(points[:, None], dst_from_src[:3]), np.float64)[:, 0]
 
 
 def _render(clouds: list[Cloud], K: NDArray[np.float64], view: View, clip: Clip) -> Rendered:

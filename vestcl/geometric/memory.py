@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.geometric.perception import Perception, Seen
+from vestcl.geometric.perception import Perception, Surface
 from vestcl.scene.exposure import STRIDE, nearest, tone_curve
 from vestcl.scene.layers import SKY_DEPTH
 from vestcl.scene.motion_plane import rays_of
@@ -110,7 +110,7 @@ def remember(perception: Perception, index: int, frames: int) -> Memory | None:
     ]  # the oldest first: once asked for, they stay
     if not kept:
         return None
-    cur, prev = perception.seen(index), perception.seen(index - 1)
+    cur, prev = perception.surface(index), perception.surface(index - 1)
     prev_from_cur, K = perception.prev_from_cur(index), perception.clip[index].K
     cur_from_src, parts, count = np.asarray(np.linalg.inv(prev_from_cur), np.float64), list[Memory](), 0
     for frame in reversed(kept):
@@ -120,8 +120,8 @@ def remember(perception: Perception, index: int, frames: int) -> Memory | None:
             continue
         image, depth = aligned
         ahead = _within_reach(depth, frame.left, cur_from_src, K)
-        shown = ahead & ~_covered(depth, ahead, cur_from_src, cur.layers.depth, ~cur.own, K)
-        shown &= ~_covered(depth, shown, prev_from_cur @ cur_from_src, prev.layers.depth, ~prev.own, K)
+        shown = ahead & ~_covered(depth, ahead, cur_from_src, cur.depth, ~cur.own, K)
+        shown &= ~_covered(depth, shown, prev_from_cur @ cur_from_src, prev.depth, ~prev.own, K)
         count += int(shown.sum())
         if count > shown.size:
             break
@@ -134,18 +134,18 @@ def _kept(perception: Perception, index: int, frames: int) -> _Kept:
 
 
 def _leave(perception: Perception, index: int) -> _Kept:
-    layers, after, K = perception.seen(index).layers, perception.seen(index + 1), perception.clip[index].K
+    frame, after, K = perception.surface(index), perception.surface(index + 1), perception.clip[index].K
     next_from_cur = np.asarray(np.linalg.inv(perception.prev_from_cur(index + 1)), np.float64)
-    static = _static(perception.seen(index)) & _even(layers.depth)
-    left = static & ~_covered(layers.depth, static, next_from_cur, after.layers.depth, _static(after), K)
-    return _Kept(layers.image, layers.depth, static, left, next_from_cur)
+    static = _static(frame) & _even(frame.depth)
+    left = static & ~_covered(frame.depth, static, next_from_cur, after.depth, _static(after), K)
+    return _Kept(frame.image, frame.depth, static, left, next_from_cur)
 
 
-def _static(seen: Seen) -> Bools:
+def _static(frame: Surface) -> Bools:
     """[1, H, W], True = static, away from the foreground and the recording car."""
-    side = 2 * max(1, round(_DILATE * seen.own.shape[2] / _WIDTH)) + 1
+    side = 2 * max(1, round(_DILATE * frame.own.shape[2] / _WIDTH)) + 1
     brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    return cv2.dilate((~seen.layers.mask | seen.own)[0].astype(np.uint8), brush)[None] == 0
+    return cv2.dilate((~frame.mask | frame.own)[0].astype(np.uint8), brush)[None] == 0
 
 
 def _even(depth: Array) -> Bools:
@@ -197,18 +197,18 @@ def _within_reach(depth: Array, which: Bools, cur_from_src: Matrix, K: Matrix) -
     return result
 
 
-def _aligned(frame: _Kept, cur_from_src: Matrix, cur: Seen, K: Matrix) -> tuple[Array, Array] | None:
+def _aligned(frame: _Kept, cur_from_src: Matrix, cur: Surface, K: Matrix) -> tuple[Array, Array] | None:
     """The frame's image [3, H, W] and depth [1, H, W] m in the exposure and scale of t; None if they disagree.
 
     The scale is s = median (z_t - t_z) / (z - t_z), z of a point brought to t, z_t what t shows there.
     """
-    layers, solid = cur.layers, frame.depth < SKY_DEPTH / 2
+    solid = frame.depth < SKY_DEPTH / 2
     grid = np.zeros_like(frame.static)
     grid[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE] = True
     grid &= frame.static & solid
     x, y, z = _project(frame.depth, grid, cur_from_src, K)
-    known = layers.mask & (layers.depth < SKY_DEPTH / 2)
-    shown = np.concatenate([layers.image, np.where(known, layers.depth, np.float32(np.nan))])
+    known = cur.mask & (cur.depth < SKY_DEPTH / 2)
+    shown = np.concatenate([cur.image, np.where(known, cur.depth, np.float32(np.nan))])
     *colours, depth = nearest(shown, x, y)
     both = np.isfinite(depth)
     z, depth, values, wanted = z[both], depth[both], frame.image[:, grid[0]][:, both], np.stack(colours)[:, both]

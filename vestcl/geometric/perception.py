@@ -1,6 +1,5 @@
 """What can be known of a clip's frames without a network: depth, own motion, masks, layers, things. Kept by frame."""
 
-import dataclasses
 import logging
 import math
 import threading
@@ -21,9 +20,9 @@ from vestcl.scene.correspondence import Correspondence, correspond
 from vestcl.scene.depth import CombinedDepth, combine_depth
 from vestcl.scene.ego_motion import ego_motion
 from vestcl.scene.estimators.sources import EstimatedFrame
-from vestcl.scene.inpaint import DEFAULT
+from vestcl.scene.inpaint import DEFAULT, inpaint_background
 from vestcl.scene.inpainters import Inpainter, inpainter
-from vestcl.scene.layers import Layers, build_layers
+from vestcl.scene.layers import Layers, without_gaps
 from vestcl.scene.lidar import densify
 from vestcl.scene.motion import backtest
 from vestcl.scene.motion.observable import on_the_road
@@ -57,6 +56,28 @@ _KEPT: Final = 4
 _LOG: Final = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What a frame shows, without what is behind its foreground: `Seen` is computed from it."""
+
+    image: NDArray[np.float32]
+    """[3, H, W] RGB in [0, 1]."""
+    depth: NDArray[np.float32]
+    """[1, H, W] m, above 0 everywhere."""
+    mask: NDArray[np.bool_]
+    """M [1, H, W], True = static background."""
+    own: NDArray[np.bool_]
+    """[1, H, W], True where the recording car itself is in the image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """The objects of a frame: `things` and `velocity` of `Seen`."""
+
+    things: NDArray[np.int32]
+    velocity: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,23 +199,39 @@ class Perception:
         """M [1, H, W], True = static background."""
         return self.once("mask", index, lambda: self._mask(index))
 
+    def surface(self, index: int) -> Surface:
+        """What the frame shows: `seen` without the background behind the foreground and without objects' velocities.
+
+        Frames before the last two are needed for no more.
+        """
+        return self._part("surface", index, lambda: self._find_surface(index))
+
+    def moving(self, index: int) -> Moving:
+        """The frame's objects, as in `seen`."""
+        return self._part("moving", index, lambda: self._find_moving(index))
+
     def seen(self, index: int) -> Seen:
         """The frame's layers and things."""
         return self.once("layers", index, lambda: self._see(index))
 
     def frame(self, index: int) -> backtest.Frame:
         """The frame as candidate motions of its points are made and tested; at frame 0 nothing came from anywhere."""
-        seen, K, image = self.seen(index), self.clip[index].K, self.image(index)
-        asked = image, seen.layers.depth, seen.velocity
+        surface, K, image = self.surface(index), self.clip[index].K, self.image(index)
+        asked = image, surface.depth, self.moving(index).velocity
         if index == 0:
             return backtest.Frame(*asked, np.zeros_like(image[:2]), np.eye(4), K)
-        motion = self._flow(index, seen.layers).flow_uv, self.prev_from_cur(index)
+        motion = self._flow(index).flow_uv, self.prev_from_cur(index)
         return backtest.Frame(*asked, *motion, K, self.clip.elapsed(index))
 
-    def _flow(self, index: int, layers: Layers) -> Correspondence:
+    def _flow(self, index: int) -> Correspondence:
         """From frame ``index`` to the one before; on the road only what the image can show."""
-        found, motion = self.correspondence(index), (self.prev_from_cur(index), self.clip[index].K)
-        return found._replace(flow_uv=on_the_road(found.flow_uv, layers.image, layers.depth, layers.mask, *motion))
+        return self._part("flow on the road", index, lambda: self._find_flow(index))
+
+    def _find_flow(self, index: int) -> Correspondence:
+        surface, found = self.surface(index), self.correspondence(index)
+        shown = surface.image, surface.depth, surface.mask
+        motion = self.prev_from_cur(index), self.clip[index].K
+        return found._replace(flow_uv=on_the_road(found.flow_uv, *shown, *motion))
 
     def inverse_std(self, index: int) -> float:
         """Standard deviation of 1 / depth, 1/m."""
@@ -219,6 +256,15 @@ class Perception:
                     self._progress(stage)
                 self._kept[key] = self._timed(stage, compute)
                 self._lifetimes[key] = max(lifetime, _KEPT)
+                self._forget(index)
+            return self._kept[key]
+
+    def _part(self, name: str, index: int, compute: Callable[[], Result]) -> Result:
+        """As `once`, of a part of the stage "layers"."""
+        key = (name, index)
+        with self._lock:
+            if key not in self._kept:
+                self._kept[key] = self._timed("layers", compute)
                 self._forget(index)
             return self._kept[key]
 
@@ -361,30 +407,49 @@ class Perception:
             return sky_mask(self.image(index), self.raw_depth(index), matched=True)
         return sky_mask(self.image(index), depth)
 
-    def _see(self, index: int) -> Seen:
-        sample, mask, depth = self.clip[index], self.mask(index), self.raw_depth(index)
-        own = self.own(index)
+    def _find_surface(self, index: int) -> Surface:
+        image, mask, own = self.image(index), self.mask(index), self.own(index)
+        depth = self._complete_depth(index)
+        if self.clip[index].ego_vehicle is None and own.any():
+            depth = np.where(own, depth.clip(max=_BONNET), depth)
+        return Surface(image, depth, mask, own)
+
+    def _complete_depth(self, index: int) -> NDArray[np.float32]:
+        """[1, H, W] m, refined by motion, that of the recording car as it is measured."""
+        return self._part("complete depth", index, lambda: self._complete(index))
+
+    def _complete(self, index: int) -> NDArray[np.float32]:
+        mask, depth, own = self.mask(index), self.raw_depth(index), self.own(index)
         if index > 0 and not self.is_monocular(index):
             view = View(self.correspondence(index), self.prev_from_cur(index))
-            depth = refine_depth(depth, self.inverse_std(index), sample.K, [view], mask & ~own)
-        layers = build_layers(self.image(index), depth, mask, sky=self._sky(index, depth), inpaint=self.inpaint)
-        if sample.ego_vehicle is None and own.any():
-            near = (np.where(own, of.clip(max=_BONNET), of) for of in (layers.depth, layers.background_depth))
-            layers = dataclasses.replace(layers, **dict(zip(("depth", "background_depth"), near, strict=True)))
-        things = objects.segment(mask, layers.depth)
-        velocity = np.zeros_like(layers.image)
-        if index > 0:
-            before = self.raw_depth(index - 1)
-            # Two depths whose scales may differ by more than an object moves.
-            if self.is_monocular(index) or self.is_monocular(index - 1):
-                before = np.zeros_like(before)
-            measured = self.raw_depth(index), before, self.inverse_std(index)
-            motion = self.correspondence(index), self.prev_from_cur(index), sample.K
-            pair = Pair(layers.image, self.image(index - 1), self.prev_from_cur(index), sample.K)
-            by_thing = search(things, objects.velocities(things, *measured, *motion), self.raw_depth(index), pair)
-            velocity = by_thing.astype(np.float32)[things].transpose(2, 0, 1)
-            followed = self._flow(index, layers), *motion[1:]
-            by_flow = objects.follow_flow(velocity, layers.image, layers.depth, *followed)
-            velocity = confirmed(by_flow, velocity, layers.depth, pair)
-            velocity /= np.float32(self.clip.elapsed(index))
-        return Seen(layers, things, velocity, own)
+            depth = refine_depth(depth, self.inverse_std(index), self.clip[index].K, [view], mask & ~own)
+        return without_gaps(self.image(index), depth, self._sky(index, depth))
+
+    def _find_moving(self, index: int) -> Moving:
+        surface, K = self.surface(index), self.clip[index].K
+        things = objects.segment(surface.mask, surface.depth)
+        if index == 0:
+            return Moving(things, np.zeros_like(surface.image))
+        depth = self.raw_depth(index)
+        # Two depths whose scales may differ by more than an object moves say nothing.
+        scaled = self.is_monocular(index) or self.is_monocular(index - 1)
+        before = np.zeros_like(depth) if scaled else self.raw_depth(index - 1)
+        measured = depth, before, self.inverse_std(index)
+        motion = self.correspondence(index), self.prev_from_cur(index), K
+        pair = Pair(surface.image, self.image(index - 1), self.prev_from_cur(index), K)
+        by_thing = search(things, objects.velocities(things, *measured, *motion), depth, pair)
+        velocity = by_thing.astype(np.float32)[things].transpose(2, 0, 1)
+        by_flow = objects.follow_flow(velocity, surface.image, surface.depth, self._flow(index), *motion[1:])
+        velocity = confirmed(by_flow, velocity, surface.depth, pair)
+        return Moving(things, velocity / np.float32(self.clip.elapsed(index)))
+
+    def _see(self, index: int) -> Seen:
+        surface, complete = self.surface(index), self._complete_depth(index)
+        behind_image, behind_depth = inpaint_background(surface.image, complete, surface.mask, method=self.inpaint)
+        if self.clip[index].ego_vehicle is None and surface.own.any():
+            behind_depth = np.where(surface.own, behind_depth.clip(max=_BONNET), behind_depth)
+        layers, moving = (
+            Layers(surface.image, surface.depth, surface.mask, behind_image, behind_depth),
+            self.moving(index),
+        )
+        return Seen(layers, moving.things, moving.velocity, surface.own)

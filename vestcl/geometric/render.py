@@ -7,8 +7,9 @@ is exact to first order whatever the weights are. The colour is taken from there
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -30,6 +31,9 @@ _OPAQUE: Final = 0.5
 #: line: a pole of one pixel has one above and one below, no farther apart than `_LINE`. The rest is spray: pixels at
 #: edges whose depth lies between that of the near and the far side.
 _NEIGHBOURS, _LINE = 3, 1.1
+
+#: Rows down and columns to the right of the eight neighbours; the first four are opposite to the last, from the end on.
+_AROUND: Final = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 
 #: Less coverage than that is a hole.
 HOLE: Final = 0.05
@@ -94,111 +98,176 @@ def show(
     planes, left = np.zeros((7, height, width), np.float32), np.ones((1, height, width), np.float32)
     uncovered = np.ones((1, height, width), np.float32)
     for cloud in clouds:
-        image, coverage = _splat(cloud, K, tgt_from_next, height, width)
+        mean, coverage = _splat(cloud, K, tgt_from_next, height, width)
         opacity = np.minimum(coverage / np.float32(_OPAQUE), 1) * (coverage > HOLE)
-        planes += left * opacity * image / np.maximum(coverage, np.float32(1e-6))
-        left = left * (1 - opacity)
-        uncovered = uncovered * (1 - coverage)
-    shown = planes / np.maximum(1 - left, np.float32(1e-6))
-    return Shown(shown.astype(np.float32), (1 - uncovered).astype(np.float32))
+        mean *= left * opacity
+        planes += mean
+        left *= 1 - opacity
+        uncovered *= 1 - coverage
+    planes /= np.maximum(1 - left, np.float32(1e-6))
+    return Shown(planes, 1 - uncovered)
 
 
 def _splat(
     cloud: Cloud, K: NDArray[np.float64], tgt_from_next: NDArray[np.float64], height: int, width: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """image [7, H, W], not divided, and coverage [1, H, W]."""
-    still = np.zeros_like(cloud.points_xyz)[None]
+    """image [7, H, W], divided by coverage, and coverage [1, H, W]."""
+    still = np.zeros((1, *cloud.points_xyz.shape), np.float32)
     points_uv, z = vestcl.displace(
         cloud.points_xyz[None], still, K[None].astype(np.float32), tgt_from_next[None].astype(np.float32)
     )
-    zoom = cloud.z_src / np.maximum(z[0], np.float32(1e-3))
-    whole, stretch = _surface(cloud, points_uv[0], zoom)
+    pixels, distance = _Pixels.of(cloud), np.maximum(z[0], np.float32(1e-3))
+    zoom, uv = cloud.z_src / distance, _transposed(points_uv[0])
+    whole, stretch = _surface(pixels, uv, zoom)
     radii = np.clip(RHO * stretch, *RADIUS_LIMITS)[None]
     opacities = (whole & (RHO * zoom <= RADIUS_LIMITS[1]))[None].astype(np.float32)
-    inverse = 1 / np.maximum(z[0], np.float32(1e-3))
-    colour = cloud.image[:, cloud.rows, cloud.columns].T
-    features = np.concatenate(
-        [colour, inverse[:, None], cloud.step_xyz, _origins(cloud, points_uv[0], zoom, whole)], axis=1
-    )
-    image, coverage = vestcl.splat(points_uv, z, radii, opacities, features[None], height, width)
-    mean = np.ascontiguousarray(image[0]) / np.maximum(coverage[0], np.float32(1e-6))
+    features = np.empty((16, len(zoom)), np.float32)
+    features[:3] = pixels.colours(cloud.image)
+    np.divide(1, distance, out=features[3])
+    features[4:7] = _transposed(cloud.step_xyz)
+    _origins(cloud, pixels, uv, zoom, whole, features[7:])
+    image, coverage = vestcl.splat(points_uv, z, radii, opacities, _transposed(features)[None], height, width)
+    mean = _transposed(image[0].transpose(1, 2, 0).reshape(-1, 16)).reshape(16, height, width)
+    mean /= np.maximum(coverage[0], np.float32(1e-6))
     mean[:3] = _colour(mean, cloud.image)
-    return mean[:7] * coverage[0], coverage[0]
+    return mean[:7], coverage[0]
 
 
-def _on_grid(cloud: Cloud, planes: NDArray[np.float32]) -> tuple[NDArray[np.intp], int, NDArray[np.float32]]:
-    """Where points are in their image with a border of one pixel, flat [N], its width, and ``planes`` [2, N] there.
+def _transposed(matrix: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The transpose in memory of its own, as NumPy copies it, in a third of the time."""
+    if not matrix.size:
+        return np.zeros(matrix.shape[::-1], np.float32)
+    return np.asarray(cv2.transpose(matrix), np.float32).reshape(matrix.shape[::-1])
 
-    Returns:
-        Indices, the width, and [2, (H + 2) (W + 2)], NaN where no point is.
+
+@dataclass(frozen=True, eq=False)
+class _Pixels:
+    """Which pixels of an image a cloud's points come from, and what their neighbours have.
+
+    Numbers of points [..., N] are laid out ("..., *") as the image [..., H, W] is where most of its pixels have a
+    point, NaN in the others; neighbours are then views. Else they stay [..., N].
     """
-    height, width = cloud.image.shape[1] + 2, cloud.image.shape[2] + 2
-    at = (cloud.rows + 1) * width + cloud.columns + 1
-    grid = np.full((2, height * width), np.nan, np.float32)
-    grid[:, at] = planes
-    return at, width, grid
+
+    height: int
+    width: int
+    flat: NDArray[np.intp]
+    """[N], of each point's pixel."""
+    dense: bool
+    """Whether most pixels have a point ..."""
+    all: bool
+    """... or each one, in order."""
+
+    @classmethod
+    def of(cls, cloud: Cloud) -> "_Pixels":
+        height, width = cloud.image.shape[1:]
+        flat = cloud.rows * width + cloud.columns
+        count = height * width
+        return cls(height, width, flat, 2 * len(flat) > count, len(flat) == count and bool((np.diff(flat) == 1).all()))
+
+    def colours(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Values [C, N] of ``image`` [C, H, W]."""
+        planes = image.reshape(len(image), -1)
+        return planes if self.all else planes.take(self.flat, axis=1)
+
+    def laid_out(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """``values`` [..., N] as [..., *]."""
+        if not self.dense:
+            return values
+        if self.all:
+            return values.reshape(*values.shape[:-1], self.height, self.width)
+        grid = np.full((*values.shape[:-1], self.height * self.width), np.nan, np.float32)
+        grid[..., self.flat] = values
+        return grid.reshape(*values.shape[:-1], self.height, self.width)
+
+    def of_points(self, values: NDArray[Any]) -> NDArray[Any]:
+        """[*] as [N], the opposite of `laid_out`."""
+        return values.ravel() if not self.dense or self.all else values.ravel()[self.flat]
+
+    def beside(self, planes: NDArray[np.float32]) -> Callable[[int, int], NDArray[np.float32]]:
+        """Values of ``planes`` [C, *] so many rows below and columns to the right, up to one: [C, *], NaN if none."""
+        grid = np.full((len(planes), self.height + 2, self.width + 2), np.nan, np.float32)
+        if self.dense:
+            grid[:, 1:-1, 1:-1] = planes
+            return lambda down, right: grid[:, 1 + down : 1 + down + self.height, 1 + right : 1 + right + self.width]
+        pitch, spread = self.width + 2, grid.reshape(len(planes), -1)
+        at = self.flat + 2 * (self.flat // self.width) + pitch + 1
+        spread[:, at] = planes
+        return lambda down, right: spread.take(at + (down * pitch + right), axis=1)
 
 
 def _origins(
-    cloud: Cloud, points_uv: NDArray[np.float32], zoom: NDArray[np.float32], solid: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """[N, 9]: s - A t, the four numbers of A, s and |s|^2: what `_colour` needs of each point.
+    cloud: Cloud,
+    pixels: _Pixels,
+    uv: NDArray[np.float32],
+    zoom: NDArray[np.float32],
+    solid: NDArray[np.bool_],
+    out: NDArray[np.float32],
+) -> None:
+    """Into ``out`` [9, N]: s - A t, the four numbers of A, s and |s|^2: what `_colour` needs of each point.
 
     A is the inverse of dt/ds, by central differences over the image that the points come from. Where they tear, or a
     neighbour is not ``solid`` [N], the colours around a point are not all its surface's: |s|^2 is larger by _EDGE.
     """
-    at, width, places = _on_grid(cloud, np.where(solid, points_uv.T, np.float32(np.nan)))
-    (a, c), (b, d) = (
-        [(plane.take(at + step) - plane.take(at - step)) / np.float32(2) for plane in places] for step in (1, width)
-    )
-    growth, alike = a * d - b * c, 1 / np.maximum(zoom, np.float32(1e-3))
-    longest = np.square(np.maximum(zoom, np.float32(1))) * constants.TORN**2
+    beside = pixels.beside(pixels.laid_out(np.where(solid, uv, np.float32(np.nan))))
+    zoomed = pixels.laid_out(zoom)
+    (a, c), (b, d) = ((beside(*step) - beside(-step[0], -step[1])) / np.float32(2) for step in ((0, 1), (1, 0)))
+    growth, alike = a * d - b * c, 1 / np.maximum(zoomed, np.float32(1e-3))
+    longest, area = np.square(np.maximum(zoomed, np.float32(1))) * constants.TORN**2, zoomed**2
     whole = (a * a + c * c < longest) & (b * b + d * d < longest)
-    whole &= (growth > _GROWTH[0] * zoom**2) & (growth < _GROWTH[1] * zoom**2)
+    whole &= (growth > _GROWTH[0] * area) & (growth < _GROWTH[1] * area)
     safe = np.where(whole, growth, np.float32(1))
-    slope = [np.where(whole, part / safe, flat) for part, flat in ((d, alike), (-b, 0), (-c, 0), (a, alike))]
-    seen = np.stack([cloud.columns, cloud.rows]).astype(np.float32) + np.float32(0.5)
-    u, v = points_uv.T
-    start = [seen[0] - slope[0] * u - slope[1] * v, seen[1] - slope[2] * u - slope[3] * v]
-    squared = seen[0] ** 2 + seen[1] ** 2 + np.where(whole, 0, np.float32(_EDGE))
-    return np.stack([*start, *slope, *seen, squared / np.float32(_SQUARED)], axis=1).astype(np.float32)
+    nothing = np.zeros((), np.float32)
+    for row, part, flat in ((2, d, alike), (3, -b, nothing), (4, -c, nothing), (5, a, alike)):
+        out[row] = pixels.of_points(np.where(whole, part / safe, flat))
+    start, slope, seen, squared = out[:2], out[2:6], out[6:8], out[8]
+    np.add(cloud.columns, np.float32(0.5), out=seen[0], casting="same_kind")
+    np.add(cloud.rows, np.float32(0.5), out=seen[1], casting="same_kind")
+    u, v = uv
+    np.subtract(seen[0] - slope[0] * u, slope[1] * v, out=start[0])
+    np.subtract(seen[1] - slope[2] * u, slope[3] * v, out=start[1])
+    edge = np.where(pixels.of_points(whole), np.float32(0), np.float32(_EDGE))
+    np.divide(seen[0] ** 2 + seen[1] ** 2 + edge, np.float32(_SQUARED), out=squared)
 
 
 def _colour(mean: NDArray[np.float32], image: NDArray[np.float32]) -> NDArray[np.float32]:
     """[3, H, W]: of ``image`` where the surface was seen; where a pixel shows several, the mean of their colours."""
     height, width = mean.shape[1:]
-    y, x = np.mgrid[:height, :width].astype(np.float32) + np.float32(0.5)
+    x, y = np.arange(width, dtype=np.float32) + np.float32(0.5), np.arange(height, dtype=np.float32) + np.float32(0.5)
+    y = y[:, None]
     start, slope, seen, squared = mean[7:9], mean[9:13], mean[13:15], mean[15] * np.float32(_SQUARED)
     u, v = start[0] + slope[0] * x + slope[1] * y, start[1] + slope[2] * x + slope[3] * y
     one = (u - seen[0]) ** 2 + (v - seen[1]) ** 2 < _EXTRAPOLATED**2
     one &= squared - seen[0] ** 2 - seen[1] ** 2 < _ONE_SURFACE**2
-    there = [cv2.remap(plane, u - 0.5, v - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in image]
+    u -= np.float32(0.5)
+    v -= np.float32(0.5)
+    there = [cv2.remap(plane, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in image]
     return np.where(one, np.stack(there), mean[:3])
 
 
 def _surface(
-    cloud: Cloud, points_uv: NDArray[np.float32], zoom: NDArray[np.float32]
+    pixels: _Pixels, uv: NDArray[np.float32], zoom: NDArray[np.float32]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """Which points [N] still have neighbours of their picture beside them, and how far apart those are [N], px.
 
-    A surface that turns towards the camera is stretched by more than what it comes nearer by: spacing >= ``zoom``.
+    ``uv`` [2, N] is where they are. A surface that turns towards the camera is stretched by more than what it comes
+    nearer by: spacing >= ``zoom``.
     """
-    mine = np.ascontiguousarray(points_uv.T)
-    at, width, places = _on_grid(cloud, mine)
-    steps = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
-    beside = []
-    for down, right in steps:
-        across, along = (plane.take(at + (down * width + right)) - own for plane, own in zip(places, mine, strict=True))
-        beside.append((across * across + along * along) / np.float32(down * down + right * right))
-    limit = np.square(np.maximum(zoom, np.float32(1)))
+    mine, zoomed = pixels.laid_out(uv), pixels.laid_out(zoom)
+    at, beside = pixels.beside(mine), dict[tuple[int, int], NDArray[np.float32]]()
+    for down, right in _AROUND:
+        across, along = at(down, right) - mine
+        across *= across
+        along *= along
+        across += along
+        beside[down, right] = across if down * right == 0 else across / np.float32(2)
+    limit = np.square(np.maximum(zoomed, np.float32(1)))
     near = np.float32(constants.TORN**2) * limit
-    count = np.add.reduce([one < near for one in beside], axis=0, dtype=np.uint8)
-    line = functools.reduce(np.fmin, map(np.maximum, beside[:4], beside[:3:-1]))
+    count = functools.reduce(np.add, ((beside[step] < near).view(np.uint8) for step in _AROUND))
+    line = functools.reduce(np.fmin, (np.maximum(beside[y, x], beside[-y, -x]) for y, x in _AROUND[:4]))
     whole = (count >= _NEIGHBOURS) | (line < np.float32(_LINE**2) * limit)
-    above, left, right, below = (beside[steps.index(step)] for step in ((-1, 0), (0, -1), (0, 1), (1, 0)))
-    gaps = (np.fmin(above, below), np.fmin(left, right))
+    gaps = np.fmin(beside[-1, 0], beside[1, 0]), np.fmin(beside[0, -1], beside[0, 1])
     spacing = np.maximum(*(np.where(gap < near, gap, np.float32(0)) for gap in gaps))
-    return whole, np.maximum(zoom, np.sqrt(spacing)).astype(np.float32)
+    return pixels.of_points(whole), pixels.of_points(np.maximum(zoomed, np.sqrt(spacing)))
 
 
 def rendered(shown: Shown, image: NDArray[np.float32]) -> Rendered:

@@ -75,16 +75,25 @@ def build_layers(
     Source: SPEC section 3.
     """
     image = _check.planes("image", image, 3)
-    depth = _check.depth("depth", depth, image)
     mask = _check.mask("mask", mask, image)
+    complete = without_gaps(image, depth, sky)
+    background_image, background_depth = inpaint_background(image, complete, mask, method=inpaint)
+    return Layers(image, complete, mask, background_image, background_depth)
+
+
+def without_gaps(image: ArrayLike, depth: ArrayLike, sky: ArrayLike | None = None) -> NDArray[np.float32]:
+    """The depth of `build_layers`, without the background: [1, H, W] m, above 0, SKY_DEPTH in the sky.
+
+    Args and raises as there.
+    """
+    image = _check.planes("image", image, 3)
+    depth = _check.depth("depth", depth, image)
     far = depth >= SKY_DEPTH if sky is None else _check.mask("sky", sky, image)
     known = np.where(far, np.float32(0), depth)
     if not (known > 0).any() and not far.all():
         raise ValueError("`depth` must have a valid pixel outside the sky, got none")
     complete = known if far.all() else complete_depth(known, image)
-    complete = np.where(far, np.float32(SKY_DEPTH), complete.clip(max=SKY_DEPTH))
-    background_image, background_depth = inpaint_background(image, complete, mask, method=inpaint)
-    return Layers(image, complete, mask, background_image, background_depth)
+    return np.where(far, np.float32(SKY_DEPTH), complete.clip(max=SKY_DEPTH))
 
 
 def batch(frames: Sequence[Layers]) -> LayerBatch:

@@ -31,8 +31,13 @@ Array = NDArray[np.float64]
 
 def rays_of(K: Array, height: int, width: int) -> Array:
     """K^-1 (u, v, 1) at pixel centres, [3, H, W]."""
-    y, x = np.mgrid[:height, :width] + 0.5
-    return np.tensordot(np.linalg.inv(K), np.stack([x, y, np.ones_like(x)]), 1)
+    return pixels_through(np.asarray(np.linalg.inv(K), np.float64), height, width)
+
+
+def pixels_through(matrix: Array, height: int, width: int) -> Array:
+    """M (u, v, 1) at pixel centres, [3, H, W], of ``matrix`` M [3, 3]."""
+    u, v = np.arange(width) + 0.5, np.arange(height) + 0.5
+    return np.add(matrix[:, 0, None, None] * u, matrix[:, 1, None, None] * v[:, None] + matrix[:, 2, None, None])
 
 
 def window_of(height: int, width: int, stride: int = 1) -> tuple[slice, slice]:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import _check
 from vestcl.scene.correspondence import Correspondence, check_size
+from vestcl.scene.motion_plane import pixels_through
 
 #: Standard deviation of dense inverse search where its flow returns, px (0.2 and 0.35 serve equally well).
 _FLOW_STD: Final = 0.25
@@ -117,8 +118,9 @@ def _measure(
 
 def pixel_centres(height: int, width: int) -> NDArray[np.float64]:
     """p [2, H, W] px, x then y."""
-    y, x = np.mgrid[:height, :width]
-    return np.stack([x + 0.5, y + 0.5])
+    centres = np.empty((2, height, width))
+    centres[0], centres[1] = np.arange(width) + 0.5, (np.arange(height) + 0.5)[:, None]
+    return centres
 
 
 def moved_pixels(flow_uv: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -130,10 +132,8 @@ def epipolar(
     K: NDArray[np.float64], dst_from_src: NDArray[np.float64], height: int, width: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """a = K R K^-1 p [3, H, W] and b = K t [3]: at inverse depth s, p is seen at p' = a + s b, divided by its third."""
-    centres = pixel_centres(height, width)
-    pixels = np.concatenate([centres, np.ones_like(centres[:1])])
     homography = K @ dst_from_src[:3, :3] @ np.linalg.inv(K)
-    return np.tensordot(homography, pixels, 1), K @ dst_from_src[:3, 3]
+    return pixels_through(homography, height, width), K @ dst_from_src[:3, 3]
 
 
 def _without_islands(inverse: NDArray[np.float32]) -> NDArray[np.float32]:
