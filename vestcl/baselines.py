@@ -106,11 +106,16 @@ def optical_flow(src: torch.Tensor, dst: torch.Tensor) -> torch.Tensor:
     sizes = check(src=(src, "B 3 H W"), dst=(dst, "B 3 H W"))
     if min(sizes["H"], sizes["W"]) < FLOW_SIDE:
         raise ValueError(f"H and W must be {FLOW_SIDE} or more for optical flow, got {sizes['H']} x {sizes['W']}")
+    flows = [flow_of_grey(*pair) for pair in zip(_grey(src), _grey(dst), strict=True)]
+    return torch.from_numpy(np.stack(flows)).permute(0, 3, 1, 2).to(src)
+
+
+def flow_of_grey(src: np.ndarray, dst: np.ndarray) -> np.ndarray:
+    """As `optical_flow`: [H, W, 2] px between 8-bit grey images [H, W], contiguous; H and W are FLOW_SIDE or more."""
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(_FINEST_SCALE)
     no_guess: Any = None  # OpenCV's stubs know none; zeros would be a guess to start from, and a bad one
-    flows = [search.calc(*pair, no_guess) for pair in zip(_grey(src), _grey(dst), strict=True)]
-    return torch.from_numpy(np.stack(flows)).permute(0, 3, 1, 2).to(src)
+    return np.asarray(search.calc(src, dst, no_guess))
 
 
 def backward_warp(image: torch.Tensor, flow_uv: torch.Tensor) -> torch.Tensor:

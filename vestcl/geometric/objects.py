@@ -115,9 +115,8 @@ def velocities(
     before = np.divide(1, depth_prev, out=np.zeros_like(depth_prev), where=depth_prev > 0)
     inverse_prev = sample(before, moved[0] - 0.5, moved[1] - 0.5)[0]
     believed = (things > 0) & (depth[0] > 0) & (correspondence.error[0] < _FLOW_ERROR)
-    for thing in range(1, len(result)):
-        here = believed & (things == thing)
-        if here.sum() < _SMALLEST / 2 * things.size:
+    for thing, here in enumerate(pixels_by_thing(things, believed, len(result))):
+        if thing == 0 or len(here) < _SMALLEST / 2 * things.size:
             continue
         y, x, points = some_points(here, _PIXELS, depth, K)
         measured = np.column_stack([moved[:, y, x].T, inverse_prev[y, x]])
@@ -125,11 +124,19 @@ def velocities(
     return result
 
 
+def pixels_by_thing(things: NDArray[np.int32], where: NDArray[np.bool_], count: int) -> list[NDArray[np.intp]]:
+    """Flat indices, rising, of the pixels of things 0 to ``count`` - 1 that are True in ``where`` [H, W]."""
+    flat = np.flatnonzero(where)
+    of = things.ravel()[flat]
+    order = np.argsort(of, kind="stable")
+    return np.split(flat[order], np.cumsum(np.bincount(of, minlength=count))[:-1])
+
+
 def some_points(
-    here: NDArray[np.bool_], most: int, depth: NDArray[np.float32], K: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Rows and columns of at most so many pixels of ``here`` [H, W], evenly chosen, and what they show, [N, 3] m."""
-    y, x = (indices[:: -(-len(indices) // most)] for indices in np.nonzero(here))
+    here: NDArray[np.intp], most: int, depth: NDArray[np.float32], K: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+    """Rows and columns of at most so many of the pixels ``here`` [N], flat, evenly chosen; what they show, [N, 3] m."""
+    y, x = np.divmod(here[:: -(-len(here) // most)], depth.shape[2])
     rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(K).T
     return y, x, rays * depth[0, y, x, None]
 

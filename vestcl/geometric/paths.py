@@ -48,7 +48,7 @@ class Paths:
         positions, depth = backtest.candidates(self.frame, self._residual, future_from_cur, ahead, self.by_flow)
         errors = self.errors[0] if ahead <= 1 else self.errors[-1]
         u, v = backtest.coherent(backtest.mixed(positions, errors), errors, self.frame.image)
-        return np.tensordot(np.linalg.inv(self.frame.K), np.stack([u, v, np.ones_like(u)]), 1) * depth
+        return np.stack([row[0] * u + row[1] * v + row[2] for row in np.linalg.inv(self.frame.K)]) * depth
 
 
 def point_paths(perception: Perception, index: int) -> Paths:

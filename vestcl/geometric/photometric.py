@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.geometric.objects import some_points
+from vestcl.geometric.objects import pixels_by_thing, some_points
 from vestcl.scene import _check
 from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import sample
@@ -69,17 +69,19 @@ class Pair(NamedTuple):
         """Mean over RGB of |colour - colour of the frame before where the point is seen there|; NaN outside of it.
 
         Args:
-            points: [n, m, 3] m in the camera's axes at t, where they would be at t - 1 had the camera not moved.
-            colours: [3, m] or [3, n, m] at t.
+            points: [3, n, m] m in the camera's axes at t, where they would be at t - 1 had the camera not moved.
+            colours: [3, n, m] at t.
 
         Returns:
             [n, m].
         """
-        there = points @ self.prev_from_cur[:3, :3].T + self.prev_from_cur[:3, 3]
-        x, y, z = np.moveaxis(there @ self.K.T, -1, 0)
+        turn, shift = self.K @ self.prev_from_cur[:3, :3], self.K @ self.prev_from_cur[:3, 3]
+        x, y, z = (
+            row[0] * points[0] + row[1] * points[1] + row[2] * points[2] + t for row, t in zip(turn, shift, strict=True)
+        )
         far = np.maximum(z, 0.1)
         seen = sample(self.image_prev, x / far - 0.5, y / far - 0.5, outside=np.nan)
-        difference = np.abs(seen - (colours if colours.ndim == 3 else colours[:, None])).mean(0)
+        difference = np.abs(seen - colours).mean(0)
         return np.where(z > 0.1, difference, np.float32(np.nan))
 
     def equally_exposed(self, depth: NDArray[np.float32], velocity: NDArray[np.float32] | None = None) -> "Pair":
@@ -121,29 +123,57 @@ def search(things: NDArray[np.int32], by_flow: Array, depth: NDArray[np.float32]
     found = np.zeros_like(by_flow)
     pair = pair.equally_exposed(np.where(things > 0, np.float32(0), depth))
     valid = (things > 0) & (depth[0] > 0)
-    for thing in range(1, len(found)):
-        here = valid & (things == thing)
-        if here.sum() < _FEWEST:
+    before = np.ascontiguousarray(pair.image_prev.transpose(1, 2, 0))
+    for thing, here in enumerate(pixels_by_thing(things, valid, len(found))):
+        if thing == 0 or len(here) < _FEWEST:
             continue
         y, x, points = some_points(here, _COMPARED, depth, pair.K)
-        found[thing] = _search(points, pair.image[:, y, x], by_flow[thing], pair)
+        found[thing] = _search(_Points(points, pair.image[:, y, x].T, before, pair), by_flow[thing])
     return found
 
 
-def _search(points: Array, colours: NDArray[np.float32], by_flow: Array, pair: Pair) -> Array:
+class _Points(NamedTuple):
+    """Points of a thing that are looked for in the frame before."""
+
+    points: Array
+    """[m, 3] m at t."""
+    colours: NDArray[np.float32]
+    """[m, 3] at t."""
+    before: NDArray[np.float32]
+    """[H, W, 3], the frame before."""
+    pair: Pair
+
+    def every(self, stride: int) -> "_Points":
+        return self._replace(points=self.points[::stride], colours=self.colours[::stride])
+
+    def unlikeness(self, tries: Array) -> NDArray[np.float32]:
+        """`Pair.unlikeness` [n, m] of the points moved by each of ``tries`` [n, 3] m: K (R x + t) - K R v."""
+        turn = self.pair.K @ self.pair.prev_from_cur[:3, :3]
+        start, shift = self.points @ turn.T + self.pair.K @ self.pair.prev_from_cur[:3, 3], tries @ turn.T
+        x, y, z = (start[:, axis] - shift[:, axis, None] for axis in range(3))
+        far = np.maximum(z, 0.1)
+        column, row = ((at / far - 0.5).astype(np.float32) for at in (x, y))
+        seen = cv2.remap(self.before, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        red, green, blue = np.moveaxis(np.abs(seen.reshape(*z.shape, 3) - self.colours), -1, 0)
+        height, width = self.before.shape[:2]
+        inside = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1) & (z > 0.1)
+        return np.where(inside, (red + green + blue) / np.float32(3), np.float32(np.nan))
+
+
+def _search(thing: _Points, by_flow: Array) -> Array:
     """One thing's v [3]."""
-    few = slice(None, None, -(-len(points) // _SEARCHED))
-    pixel = _of_a_pixel(points[few], pair.K)
+    few = thing.every(-(-len(thing.points) // _SEARCHED))
+    pixel = _of_a_pixel(few.points, thing.pair.K)
     lines = [
         np.arange(-count, count + 1)[:, None] * step * axis
         for axis, step, count in zip(_AXES, pixel, np.minimum(_FARTHEST / pixel, _MOST).astype(int), strict=True)
     ]
     tries = np.concatenate([np.zeros((1, 3)), by_flow[None], *lines])
-    best = tries[_costs(points[few], colours[:, few], tries, pair).argmin()]
+    best = tries[_costs(few, tries).argmin()]
     for size in _SIZES:
         around = best + size * (_AROUND * pixel) @ _AXES
-        best = around[_costs(points[few], colours[:, few], around, pair).argmin()]
-    still, moving = _costs(points, colours, np.stack([np.zeros(3), best]), pair)
+        best = around[_costs(few, around).argmin()]
+    still, moving = _costs(thing, np.stack([np.zeros(3), best]))
     moves = np.linalg.norm(best) >= _SLOWEST and moving < min(_LEFT * still, still - _NOISE)
     return best if moves else np.zeros(3)
 
@@ -155,14 +185,14 @@ def _of_a_pixel(points: Array, K: Array) -> Array:
     return np.asarray(np.maximum(np.array([z, z**2 / spread]) / K[0, 0], _FARTHEST / _MOST), np.float64)
 
 
-def _costs(points: Array, colours: NDArray[np.float32], tries: Array, pair: Pair) -> NDArray[np.float32]:
+def _costs(thing: _Points, tries: Array) -> NDArray[np.float32]:
     """Mean unlikeness of each of ``tries`` [n, 3], infinite where too little is inside the frame before; but for v = 0
     a single point will do."""
-    difference = np.minimum(pair.unlikeness(points - tries[:, None], colours), np.float32(_OTHER))
+    difference = np.minimum(thing.unlikeness(tries), np.float32(_OTHER))
     inside = np.isfinite(difference)
     count = inside.sum(1)
     mean = np.where(inside, difference, 0).sum(1) / np.maximum(count, 1)
-    enough = (count >= _INSIDE * len(points)) | ((count > 0) & ~tries.any(1))
+    enough = (count >= _INSIDE * len(thing.points)) | ((count > 0) & ~tries.any(1))
     return np.where(enough, mean, np.float32(np.inf))
 
 
@@ -195,6 +225,6 @@ def confirmed(
 def _difference(velocity: NDArray[np.float32], depth: NDArray[np.float32], pair: Pair) -> NDArray[np.float32]:
     """[H, W], averaged over windows; what was outside the frame before differs by OTHER."""
     height, width = depth.shape[1:]
-    points = np.moveaxis(rays_of(pair.K, height, width) * depth - velocity, 0, -1)
+    points = rays_of(pair.K, height, width) * depth - velocity
     known = np.minimum(np.nan_to_num(pair.unlikeness(points, pair.image), nan=_OTHER), np.float32(_OTHER))
     return np.asarray(cv2.blur(known, (_WINDOW, _WINDOW)), np.float32)

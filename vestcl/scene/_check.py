@@ -72,4 +72,6 @@ def _check_shape(name: str, array: NDArray[Any], channels: int, like: NDArray[An
 
 def pixels(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     """[C, H, W] in [0, 1] as OpenCV wants it: [H, W, C] uint8; what is outside the range is clipped."""
-    return np.ascontiguousarray((image.clip(0, 1) * 255).round().astype(np.uint8).transpose(1, 2, 0))
+    scaled = image.clip(0, 1)
+    scaled *= 255
+    return np.ascontiguousarray(np.rint(scaled, out=scaled).astype(np.uint8).transpose(1, 2, 0))

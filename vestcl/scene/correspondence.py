@@ -4,7 +4,6 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl import baselines
@@ -46,21 +45,32 @@ def correspond(src: ArrayLike, dst: ArrayLike) -> Correspondence:
     """
     src = _check.planes("src", src, 3)
     dst = _check.planes("dst", dst, 3, src)
-    there = _flow(src, dst)
+    height, width = src.shape[1:]
+    if min(height, width) < baselines.FLOW_SIDE:
+        raise ValueError(f"H and W must be {baselines.FLOW_SIDE} or more for optical flow, got {height} x {width}")
+    grey_src, grey_dst = _grey(src), _grey(dst)
+    there = _flow(grey_src, grey_dst)
     matched = matched_for_flow(dst, src, there)
     if matched is not dst:
-        there = _flow(src, matched)
-    back = _flow(matched, src)
-    y, x = np.mgrid[: src.shape[1], : src.shape[2]].astype(np.float32)
+        grey_dst = _grey(matched)
+        there = _flow(grey_src, grey_dst)
+    back = _flow(grey_dst, grey_src)
+    x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
     returned = sample(back, x + there[0], y + there[1], outside=np.inf)
     missed = (there + returned).astype(np.float64)
     error = np.sqrt((missed**2).sum(0) + np.square(_NOISE / np.maximum(_texture(src), 1e-6)))
     return Correspondence(there, error[None].astype(np.float32))
 
 
-def _flow(src: NDArray[np.float32], dst: NDArray[np.float32]) -> NDArray[np.float32]:
+def _grey(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """8-bit grey [H, W]."""
+    return np.asarray(cv2.cvtColor(_check.pixels(image), cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def _flow(src: NDArray[np.uint8], dst: NDArray[np.uint8]) -> NDArray[np.float32]:
     """[2, H, W] px."""
-    return baselines.optical_flow(torch.from_numpy(src)[None], torch.from_numpy(dst)[None])[0].numpy()
+    flow = baselines.flow_of_grey(src, dst)
+    return np.stack([flow[..., 0], flow[..., 1]]).astype(np.float32, copy=False)
 
 
 def _texture(image: NDArray[np.float32]) -> NDArray[np.float32]:

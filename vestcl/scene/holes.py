@@ -11,6 +11,9 @@ from vestcl.scene.sides import carry_on
 #: Surroundings count by 1 / (1/z + that)^2, 1/m: what was hidden is likelier to go on behind a hole than what hid it.
 _FAR: Final = 0.01
 
+#: OpenCV resizes up to so many channels at once.
+_CV_CHANNELS: Final = 4
+
 #: Holes up to that share of the picture's width across are cracks.
 _CRACK: Final = 0.006
 
@@ -66,9 +69,12 @@ def deep_holes(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _at_border(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The holes [H, W] that reach the picture's border: nobody hid them, they were out of sight."""
-    _, labels = cv2.connectedComponents(hole.astype(np.uint8))
-    border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    return np.asarray(np.isin(labels, border[border > 0]))
+    count, labels = cv2.connectedComponents(hole.astype(np.uint8))
+    at_border = np.zeros(count, bool)
+    for side in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        at_border[side] = True
+    at_border[0] = False
+    return np.asarray(at_border[labels])
 
 
 def _pull(image: NDArray[np.float32], weight: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -91,4 +97,6 @@ def _pull(image: NDArray[np.float32], weight: NDArray[np.float32]) -> tuple[NDAr
 
 def _resized(planes: NDArray[np.float32], size: tuple[int, int], interpolation: int) -> NDArray[np.float32]:
     """[H, W, C] at ``size`` (width, height), of any number of channels."""
+    if 1 < planes.shape[2] <= _CV_CHANNELS:
+        return np.asarray(cv2.resize(planes, size, interpolation=interpolation), np.float32)
     return np.stack([cv2.resize(plane, size, interpolation=interpolation) for plane in np.moveaxis(planes, -1, 0)], -1)

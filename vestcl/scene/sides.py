@@ -47,12 +47,14 @@ def carry_on(filled: Array, hole: NDArray[np.bool_], at_border: NDArray[np.bool_
     first, share = np.floor(line).astype(np.intp), line % 1.0
     edge = np.clip(edges[first % len(edges)] * (1 - share) + edges[(first + 1) % len(edges)] * share, 1.0, r)
     shrunk = 1 / (2 * r / edge - 1)  # r' / r
-    column, row, weight = np.zeros((3, height, width))
+    column, row = np.zeros((2, height, width), np.float32)
     column[y, x] = np.clip(u + shrunk * across - 0.5, 0, width - 1)
     row[y, x] = np.clip(v + shrunk * down - 0.5, 0, height - 1)
-    weight[y, x] = np.exp(-(r / edge - 1) / _DECAY)
-    mixed = weight * sample(filled, column, row) + (1 - weight) * filled
-    return np.where(at_border, mixed, filled).astype(np.float32)
+    weight = np.exp(-(r / edge - 1) / _DECAY)
+    result = np.array(filled, np.float32)
+    for plane, mirrored in zip(result, sample(filled, column, row), strict=True):
+        plane[y, x] = weight * mirrored[y, x] + (1 - weight) * plane[y, x]
+    return result
 
 
 def _edges(hole: NDArray[np.bool_], vanishing_uv: Matrix) -> Matrix:
@@ -61,9 +63,12 @@ def _edges(hole: NDArray[np.bool_], vanishing_uv: Matrix) -> Matrix:
     lines, reach = 2 * (height + width), max(1, round(_SMOOTH * width / _WIDTH))
     farthest = int(np.hypot(max(abs(u), abs(u - width)), max(abs(v), abs(v - height)))) + 1
     angles, r = (np.arange(lines) + 0.5) * (2 * np.pi / lines), np.arange(1, farthest)
-    x, y = (np.floor(start + np.outer(turn(angles), r)).astype(np.intp) for start, turn in ((u, np.cos), (v, np.sin)))
-    known = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    known &= ~hole[y.clip(0, height - 1), x.clip(0, width - 1)]
+    inside = np.pad(~hole, 1)  # what is outside the image is not known
+    column, row = (
+        np.floor((start + np.outer(turn(angles), r)).clip(-1, size)) + 1
+        for start, turn, size in ((u, np.cos, width), (v, np.sin, height))
+    )
+    known = inside.take((row * (width + 2) + column).astype(np.intp))
     last = np.where(known.any(axis=1), farthest - 1 - np.argmax(known[:, ::-1], axis=1), 0).astype(np.float32)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(last, 3 * reach, "wrap"), 2 * reach + 1)
     smooth = cv2.GaussianBlur(np.median(around, axis=1)[None], (4 * reach + 1, 1), reach / 2)[0]

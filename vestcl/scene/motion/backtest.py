@@ -17,8 +17,7 @@ from vestcl.scene import _check
 from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import sample
 from vestcl.scene.exposure import as_exposed
-from vestcl.scene.motion_plane import rays_of
-from vestcl.scene.parallax import moved_pixels, pixel_centres
+from vestcl.scene.parallax import epipolar, moved_pixels, pixel_centres
 
 Array = NDArray[np.float32]
 
@@ -75,9 +74,9 @@ def residual_flow(frame: Frame) -> Array:
     p' is where the point would have been in the frame before at rest. 0 where the difference is no motion but a wrong
     match.
     """
-    q, z = _project(frame, frame.prev_from_cur, np.zeros((3, 1, 1), np.float32))
-    residual = (q - moved_pixels(frame.flow_uv)) / frame.elapsed
-    believed = (z > _NEAREST) & (np.hypot(*residual) < _LARGEST)
+    there = _brought(frame, frame.prev_from_cur)
+    residual = (_pixels(there) - moved_pixels(frame.flow_uv)) / frame.elapsed
+    believed = (there[2] > _NEAREST) & (np.hypot(*residual) < _LARGEST)
     return np.where(believed, residual, 0).astype(np.float32)
 
 
@@ -101,9 +100,10 @@ def candidates(
     Returns:
         [C, 2, H, W] px, and [H, W] m, the depth there by the first candidate.
     """
-    by_object, z = _project(frame, future_from_cur, ahead * frame.velocity)
-    rest, _ = _project(frame, future_from_cur, np.zeros((3, 1, 1), np.float32))
-    found = [by_object, rest, rest + ahead * residual, rest + _followed(residual, ahead)]
+    at_rest = _brought(frame, future_from_cur)
+    moved = at_rest + _turned(frame.K @ future_from_cur[:3, :3], ahead * frame.velocity)
+    z, rest = moved[2], _pixels(at_rest)
+    found = [_pixels(moved), rest, rest + ahead * residual, rest + _followed(residual, ahead)]
     if by_flow:
         found.append(pixel_centres(*frame.depth.shape[1:]) - frame.flow_uv * (ahead / frame.elapsed))
     return np.stack(found).astype(np.float32), np.maximum(z, _NEAREST).astype(np.float32)
@@ -188,15 +188,23 @@ def coherent(positions: Array, errors: Array, image: Array) -> Array:
     return np.asarray(positions + unexplained * (around - way), np.float32)
 
 
-def _project(
-    frame: Frame, dst_from_src: NDArray[np.float64], shift: Array
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """[2, H, W] px and [H, W] m in another camera of what the pixels show, moved by ``shift`` [3, H, W] before."""
-    height, width = frame.depth.shape[1:]
-    points = (rays_of(frame.K, height, width) * frame.depth + shift).reshape(3, -1)
-    q = frame.K @ (dst_from_src[:3, :3] @ points + dst_from_src[:3, 3:])
-    uv = q[:2] / np.maximum(q[2], _NEAREST)
-    return uv.reshape(2, height, width), q[2].reshape(height, width)
+def _brought(frame: Frame, dst_from_src: NDArray[np.float64]) -> NDArray[np.float64]:
+    """K (R x + t) [3, H, W] of the points x that the pixels show: z m and, over it, px in another camera."""
+    start, shift = epipolar(frame.K, dst_from_src, *frame.depth.shape[1:])
+    start *= frame.depth
+    start += shift[:, None, None]
+    return start
+
+
+def _turned(matrix: NDArray[np.float64], vectors: Array) -> NDArray[np.float64]:
+    """M v [3, H, W] of vectors [3, H, W]."""
+    x, y, z = vectors
+    return np.stack([row[0] * x + row[1] * y + row[2] * z for row in matrix], dtype=np.float64)
+
+
+def _pixels(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[2, H, W] px of q [3, H, W]."""
+    return q[:2] / np.maximum(q[2], _NEAREST)
 
 
 def _followed(residual: Array, ahead: float) -> Array:
