@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vestcl.geometric.perception import Perception, Surface
 from vestcl.scene.exposure import STRIDE, nearest, tone_curve
 from vestcl.scene.layers import SKY_DEPTH
-from vestcl.scene.motion_plane import rays_of
+from vestcl.scene.motion_plane import linear
 
 #: Frames before t-1 that are remembered if nothing else is asked for; `docs/memory.md` has the figures.
 MEMORY: Final = 3
@@ -156,14 +156,15 @@ def _even(depth: Array) -> Bools:
 
 def _points(depth: Array, which: Bools, dst_from_src: Matrix, K: Matrix) -> Matrix:
     """[3, N] m, the pixels of ``which`` in another camera."""
-    points = rays_of(K, *depth.shape[1:])[:, which[0]] * depth[which]
-    return np.asarray(dst_from_src[:3, :3] @ points + dst_from_src[:3, 3:], np.float64)
+    rows, columns = np.nonzero(which[0])
+    rays = linear(np.linalg.inv(K), [columns + 0.5, rows + 0.5, np.ones(len(rows))])
+    return linear(dst_from_src[:3, :3], rays * depth[which]) + dst_from_src[:3, 3:]
 
 
 def _project(depth: Array, which: Bools, dst_from_src: Matrix, K: Matrix) -> Matrix:
     """[3, N]: column and row in another camera, 0 = the first one's centre, and z in m; column NaN where z is small."""
     there = _points(depth, which, dst_from_src, K)
-    u, v, _ = (K @ there) / np.maximum(there[2], _NEAREST)
+    u, v, _ = linear(K, there) / np.maximum(there[2], _NEAREST)
     return np.stack([np.where(there[2] > _NEAREST, u - 0.5, np.nan), v - 0.5, there[2]])
 
 

@@ -10,7 +10,7 @@ from vestcl.scene import _check
 from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import Correspondence, sample
 from vestcl.scene.layers import SKY_DEPTH
-from vestcl.scene.motion_plane import rays_of
+from vestcl.scene.motion_plane import linear, rays_of
 from vestcl.scene.parallax import moved_pixels
 
 #: Neighbours whose depths differ by a larger factor belong to different things.
@@ -167,9 +167,9 @@ def follow_flow(
         [3, H, W] m a frame.
     """
     height, width = depth.shape[1:]
-    points = (rays_of(K, height, width) * depth - velocity).reshape(3, -1)
-    there = (prev_from_cur[:3, :3] @ points + prev_from_cur[:3, 3:]).reshape(3, height, width)
-    q = np.tensordot(K, there, 1)
+    points = rays_of(K, height, width) * depth - velocity
+    there = linear(prev_from_cur[:3, :3], points) + prev_from_cur[:3, 3, None, None]
+    q = linear(K, there)
     residual = moved_pixels(correspondence.flow_uv) - q[:2] / np.maximum(q[2], 0.1)
     believed = (depth[0] < SKY_DEPTH) & (q[2] > 0.1) & (np.hypot(*residual) < _LARGEST)
     guide, share = _check.pixels(image), (believed / (1 + correspondence.error[0] ** 4)).astype(np.float32)

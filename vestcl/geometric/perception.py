@@ -259,12 +259,12 @@ class Perception:
                 self._forget(index)
             return self._kept[key]
 
-    def _part(self, name: str, index: int, compute: Callable[[], Result]) -> Result:
-        """As `once`, of a part of the stage "layers"."""
+    def _part(self, name: str, index: int, compute: Callable[[], Result], stage: str = "layers") -> Result:
+        """As `once`, of a part of a stage."""
         key = (name, index)
         with self._lock:
             if key not in self._kept:
-                self._kept[key] = self._timed("layers", compute)
+                self._kept[key] = self._timed(stage, compute)
                 self._forget(index)
             return self._kept[key]
 
@@ -397,7 +397,11 @@ class Perception:
             rigid = rigid_pixels(self.raw_depth(index), sample.K, self.prev_from_cur(index))
             pair = self.image(index), self.image(index - 1), self.correspondence(index)
             mask = ~whole_objects(~mask[0], *pair, rigid)[None]
-        return mask | self.own(index) | self._sky(index, self.raw_depth(index))
+        return mask | self.own(index) | self._measured_sky(index)
+
+    def _measured_sky(self, index: int) -> NDArray[np.bool_]:
+        """`_sky` by the depth as it was measured."""
+        return self._part("sky", index, lambda: self._sky(index, self.raw_depth(index)), "mask")
 
     def _sky(self, index: int, depth: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:
         sample = self.clip[index]
@@ -423,7 +427,11 @@ class Perception:
         if index > 0 and not self.is_monocular(index):
             view = View(self.correspondence(index), self.prev_from_cur(index))
             depth = refine_depth(depth, self.inverse_std(index), self.clip[index].K, [view], mask & ~own)
-        return without_gaps(self.image(index), depth, self._sky(index, depth))
+        same = depth is self.raw_depth(index) or (
+            self.clip[index].right is not None and self._given_depth(index) is None
+        )
+        sky = self._measured_sky(index) if same else self._sky(index, depth)
+        return without_gaps(self.image(index), depth, sky)
 
     def _find_moving(self, index: int) -> Moving:
         surface, K = self.surface(index), self.clip[index].K

@@ -15,7 +15,7 @@ from vestcl.scene import _check
 from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import sample
 from vestcl.scene.exposure import STRIDE, nearest, tone_curve
-from vestcl.scene.motion_plane import rays_of
+from vestcl.scene.motion_plane import linear, rays_of
 from vestcl.scene.regions import mean_by_region, superpixels
 
 Array = NDArray[np.float64]
@@ -75,10 +75,8 @@ class Pair(NamedTuple):
         Returns:
             [n, m].
         """
-        turn, shift = self.K @ self.prev_from_cur[:3, :3], self.K @ self.prev_from_cur[:3, 3]
-        x, y, z = (
-            row[0] * points[0] + row[1] * points[1] + row[2] * points[2] + t for row, t in zip(turn, shift, strict=True)
-        )
+        shift = self.K @ self.prev_from_cur[:3, 3]
+        x, y, z = linear(self.K @ self.prev_from_cur[:3, :3], points) + shift[:, None, None]
         far = np.maximum(z, 0.1)
         seen = sample(self.image_prev, x / far - 0.5, y / far - 0.5, outside=np.nan)
         difference = np.abs(seen - colours).mean(0)

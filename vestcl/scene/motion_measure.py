@@ -137,13 +137,14 @@ def _triangulate(
     a, b = epipolar(K, motion, *flow.shape[1:])
     b = b[:, None, None]
     constant, slope = a[:2] - moved * a[2], b[:2] - moved * b[2]
-    steepness = np.maximum((slope**2).sum(0), 1e-9)
-    inverse = -(constant * slope).sum(0) / steepness
+    steepness = np.maximum(slope[0] ** 2 + slope[1] ** 2, 1e-9)
+    inverse = -(constant[0] * slope[0] + constant[1] * slope[1]) / steepness
     z = np.maximum(a[2] + inverse * b[2], 1e-3)
     off = np.abs(constant[0] * slope[1] - constant[1] * slope[0]) / np.sqrt(steepness) / z
     noise = np.hypot(_FLOW_STD, _FLOW_SHARE * np.hypot(*flow)) + error[0].clip(max=_FLOW_ERROR) / 2
-    contrast = (slope**2 * texture[:2]).sum(0) + 2 * slope[0] * slope[1] * texture[2]
-    noise = np.hypot(noise, _GREY_STD * np.sqrt(steepness / np.maximum(contrast, 1e-12)))
+    xx, yy, xy = texture
+    contrast = slope[0] ** 2 * xx + slope[1] ** 2 * yy + 2 * slope[0] * slope[1] * xy
+    noise = np.sqrt(noise.astype(np.float64) ** 2 + _GREY_STD**2 * (steepness / np.maximum(contrast, 1e-12)))
     returns = (error[0] < _FLOW_ERROR) & (noise < _FLOW_ERROR)
     std = np.where(returns & (off < _OFF_LINE), noise * z / np.sqrt(steepness), np.inf)
     return inverse, std, returns & (off > 2 * _OFF_LINE)

@@ -4,7 +4,7 @@ import warnings
 from typing import Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from skimage.measure import ransac
 
 #: Where the road is looked for: below that share of the height, within that share of the width about the middle.
@@ -38,6 +38,12 @@ def pixels_through(matrix: Array, height: int, width: int) -> Array:
     """M (u, v, 1) at pixel centres, [3, H, W], of ``matrix`` M [3, 3]."""
     u, v = np.arange(width) + 0.5, np.arange(height) + 0.5
     return np.add(matrix[:, 0, None, None] * u, matrix[:, 1, None, None] * v[:, None] + matrix[:, 2, None, None])
+
+
+def linear(matrix: ArrayLike, planes: ArrayLike) -> Array:
+    """M v [3, ...] of ``matrix`` M [3, 3] and vectors [3, ...], written out: for three rows BLAS takes longer."""
+    x, y, z = np.asarray(planes)
+    return np.stack([row[0] * x + row[1] * y + row[2] * z for row in np.asarray(matrix, np.float64)])
 
 
 def window_of(height: int, width: int, stride: int = 1) -> tuple[slice, slice]:

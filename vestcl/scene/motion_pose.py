@@ -168,8 +168,10 @@ def _sampson(motion: Array, src: Array, dst: Array) -> Array:
     x, y, z = motion[:3, 3]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ motion[:3, :3]
     lines_dst, lines_src = src @ essential.T, dst @ essential
-    gradient = np.sqrt((lines_dst[:, :2] ** 2).sum(1) + (lines_src[:, :2] ** 2).sum(1))
-    return np.asarray((dst * lines_dst).sum(1) / np.maximum(gradient, 1e-12))
+    (a, b, c), (d, e, _) = lines_dst.T, lines_src.T
+    gradient = np.sqrt((a**2 + b**2) + (d**2 + e**2))
+    distance = dst[:, 0] * a + dst[:, 1] * b + dst[:, 2] * c
+    return np.asarray(distance / np.maximum(gradient, 1e-12))
 
 
 def _cauchy(residual: Array, bend: float) -> Array:

@@ -101,19 +101,42 @@ def _measure(
     flow, error = view.correspondence
     moved = moved_pixels(flow)
     start, slope = epipolar(K, view.dst_from_src, *flow.shape[1:])
-    inverse = given[0].astype(np.float64)
-    for turn in range(2):  # where nothing is given, the first turn only finds where to linearise
-        q = start + inverse * slope[:, None, None]
-        jacobian = (slope[:2, None, None] * start[2] - start[:2] * slope[2]) / q[2] ** 2
-        residual = moved - q[:2] / q[2]
-        precision = (jacobian**2).sum(0)
-        step = (jacobian * residual).sum(0) / np.maximum(precision, 1e-9)
-        if turn == 0:
-            inverse = np.where(known[0], inverse, np.clip(inverse + step, 0, 1 / 3))
+    inverse, unknown = given[0].astype(np.float64), ~known[0]
+    if unknown.any():  # there a first step finds where to linearise
+        guess = inverse[unknown]
+        guess += _step(start[:, unknown], slope, moved[:, unknown], guess).step
+        inverse[unknown] = np.clip(guess, 0, 1 / 3)
+    step, off_line, precision, z = _step(start, slope, moved, inverse)
     measured = inverse + step
-    off_line = np.hypot(*(residual - jacobian * step))
-    trusted = (error[0] < _FLOW_ERROR) & (off_line < _OFF_LINE) & (measured > 0) & (q[2] > 0)
+    trusted = (error[0] < _FLOW_ERROR) & (off_line < _OFF_LINE**2) & (measured > 0) & (z > 0)
     return measured[None].astype(np.float32), precision[None].astype(np.float32), trusted[None]
+
+
+class _Step(NamedTuple):
+    """A Gauss-Newton step of inverse depths."""
+
+    step: NDArray[np.float64]
+    """[...] 1/m."""
+    off_line: NDArray[np.float64]
+    """[...] px^2, the squared distance of what flow shows from the epipolar line."""
+    precision: NDArray[np.float64]
+    """[...] |dp'/ds|^2 (px m)^2."""
+    z: NDArray[np.float64]
+    """[...], above 0 in front of the other camera."""
+
+
+def _step(
+    start: NDArray[np.float64], slope: NDArray[np.float64], moved: NDArray[np.float64], inverse: NDArray[np.float64]
+) -> _Step:
+    """From ``inverse`` [...] 1/m, for p' = a + s b with a ``start`` [3, ...] and b ``slope`` [3]."""
+    x, y, z = (a + inverse * b for a, b in zip(start, slope, strict=True))
+    squared = z**2
+    along, down = ((slope[i] * start[2] - start[i] * slope[2]) / squared for i in (0, 1))
+    right, below = moved[0] - x / z, moved[1] - y / z
+    precision = along**2 + down**2
+    step = (along * right + down * below) / np.maximum(precision, 1e-9)
+    off_line = (right - along * step) ** 2 + (below - down * step) ** 2
+    return _Step(step, off_line, precision, z)
 
 
 def pixel_centres(height: int, width: int) -> NDArray[np.float64]:

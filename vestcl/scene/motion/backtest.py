@@ -17,6 +17,7 @@ from vestcl.scene import _check
 from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import sample
 from vestcl.scene.exposure import as_exposed
+from vestcl.scene.motion_plane import linear
 from vestcl.scene.parallax import epipolar, moved_pixels, pixel_centres
 
 Array = NDArray[np.float32]
@@ -101,7 +102,7 @@ def candidates(
         [C, 2, H, W] px, and [H, W] m, the depth there by the first candidate.
     """
     at_rest = _brought(frame, future_from_cur)
-    moved = at_rest + _turned(frame.K @ future_from_cur[:3, :3], ahead * frame.velocity)
+    moved = at_rest + linear(frame.K @ future_from_cur[:3, :3], ahead * frame.velocity)
     z, rest = moved[2], _pixels(at_rest)
     found = [_pixels(moved), rest, rest + ahead * residual, rest + _followed(residual, ahead)]
     if by_flow:
@@ -194,12 +195,6 @@ def _brought(frame: Frame, dst_from_src: NDArray[np.float64]) -> NDArray[np.floa
     start *= frame.depth
     start += shift[:, None, None]
     return start
-
-
-def _turned(matrix: NDArray[np.float64], vectors: Array) -> NDArray[np.float64]:
-    """M v [3, H, W] of vectors [3, H, W]."""
-    x, y, z = vectors
-    return np.stack([row[0] * x + row[1] * y + row[2] * z for row in matrix], dtype=np.float64)
 
 
 def _pixels(q: NDArray[np.float64]) -> NDArray[np.float64]:
