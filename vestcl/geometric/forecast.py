@@ -280,11 +280,11 @@ def _render(clouds: list[Cloud], K: NDArray[np.float64], view: View, clip: Clip)
     shown = show(clouds[:2], *seen_from)
     hole = holes(shown)
     if len(clouds) > 3 and hole.any():
-        shown = _filled(shown, show(clouds[2:3], *seen_from), hole)
+        shown = _filled(shown, show(clouds[2:3], *seen_from, where=hole), hole)
         hole = holes(shown)
     coverage, deep = shown.coverage, deep_holes(hole)
     if deep.any():
-        behind = show(clouds[-1:], *seen_from)
+        behind = show(clouds[-1:], *seen_from, where=deep)
         deep &= ~holes(behind)
         shown, hole = Shown(_filled(shown, behind, deep).planes, coverage), hole & ~deep
     ahead = K @ view.tgt_from_next[:3, 2]

@@ -7,6 +7,7 @@ is exact to first order whatever the weights are. The colour is taken from there
 """
 
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
@@ -48,6 +49,9 @@ _EDGE: Final = 10 * _ONE_SURFACE**2
 #: The area that a pixel of the source grows to, as a factor of what its depth says, lies in this range on a surface.
 _GROWTH: Final = (0.2, 5.0)
 
+#: OpenCV looks up places in rows of fewer than 32,768.
+_ROW: Final = 1024
+
 #: Squared positions are carried in thousands of pixels, so that float32 keeps their differences.
 _SQUARED: Final = 1000.0
 
@@ -81,7 +85,12 @@ class Shown:
 
 
 def show(
-    clouds: list[Cloud], K: NDArray[np.float64], tgt_from_next: NDArray[np.float64], height: int, width: int
+    clouds: list[Cloud],
+    K: NDArray[np.float64],
+    tgt_from_next: NDArray[np.float64],
+    height: int,
+    width: int,
+    where: NDArray[np.bool_] | None = None,
 ) -> Shown:
     """The clouds splatted one by one to a view, each behind those before it: sum_i c_i a_i prod_(j<i) (1 - a_j).
 
@@ -91,31 +100,46 @@ def show(
         tgt_from_next: [4, 4] m.
         height: px.
         width: px.
+        where: [1, H, W], True in the pixels that are wanted; None wants all.
 
     Returns:
-        The composition; 0 where nothing is.
+        The composition; 0 where nothing is, and in pixels that are not wanted.
     """
-    planes, left = np.zeros((7, height, width), np.float32), np.ones((1, height, width), np.float32)
-    uncovered = np.ones((1, height, width), np.float32)
+    wanted = np.arange(height * width) if where is None else np.flatnonzero(where)
+    planes, left = np.zeros((7, len(wanted)), np.float32), np.ones(len(wanted), np.float32)
+    uncovered = np.ones(len(wanted), np.float32)
     for cloud in clouds:
-        mean, coverage = _splat(cloud, K, tgt_from_next, height, width)
+        mean, coverage = _splat(cloud, K, tgt_from_next, height, width, None if where is None else wanted)
         opacity = np.minimum(coverage / np.float32(_OPAQUE), 1) * (coverage > HOLE)
         mean *= left * opacity
         planes += mean
         left *= 1 - opacity
         uncovered *= 1 - coverage
     planes /= np.maximum(1 - left, np.float32(1e-6))
-    return Shown(planes, 1 - uncovered)
+    both = np.concatenate([planes, 1 - uncovered[None]])
+    if where is not None:
+        some, both = both, np.zeros((8, height * width), np.float32)
+        both[:, wanted] = some
+    both = both.reshape(8, height, width)
+    return Shown(both[:7], both[7:])
 
 
 def _splat(
-    cloud: Cloud, K: NDArray[np.float64], tgt_from_next: NDArray[np.float64], height: int, width: int
+    cloud: Cloud,
+    K: NDArray[np.float64],
+    tgt_from_next: NDArray[np.float64],
+    height: int,
+    width: int,
+    wanted: NDArray[np.intp] | None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """image [7, H, W], divided by coverage, and coverage [1, H, W]."""
+    """image [7, M], divided by coverage, and coverage [M], of the pixels ``wanted`` [M], flat; None = all."""
     still = np.zeros((1, *cloud.points_xyz.shape), np.float32)
     points_uv, z = vestcl.displace(
         cloud.points_xyz[None], still, K[None].astype(np.float32), tgt_from_next[None].astype(np.float32)
     )
+    if wanted is not None:
+        kept = _near(cloud, points_uv[0], wanted, height, width)
+        cloud, points_uv, z = _some(cloud, kept), points_uv[:, kept], z[:, kept]
     pixels, distance = _Pixels.of(cloud), np.maximum(z[0], np.float32(1e-3))
     zoom, uv = cloud.z_src / distance, _transposed(points_uv[0])
     whole, stretch = _surface(pixels, uv, zoom)
@@ -127,10 +151,39 @@ def _splat(
     features[4:7] = _transposed(cloud.step_xyz)
     _origins(cloud, pixels, uv, zoom, whole, features[7:])
     image, coverage = vestcl.splat(points_uv, z, radii, opacities, _transposed(features)[None], height, width)
-    mean = _transposed(image[0].transpose(1, 2, 0).reshape(-1, 16)).reshape(16, height, width)
-    mean /= np.maximum(coverage[0], np.float32(1e-6))
-    mean[:3] = _colour(mean, cloud.image)
-    return mean[:7], coverage[0]
+    composite, covered = image[0].transpose(1, 2, 0).reshape(-1, 16), coverage.ravel()
+    if wanted is not None:
+        composite, covered = composite[wanted], covered[wanted]
+    mean = _transposed(composite)
+    mean /= np.maximum(covered, np.float32(1e-6))
+    mean[:3] = _colour(mean, cloud.image, np.arange(height * width) if wanted is None else wanted, width)
+    return mean[:7], covered
+
+
+def _near(
+    cloud: Cloud, points_uv: NDArray[np.float32], wanted: NDArray[np.intp], height: int, width: int
+) -> NDArray[np.bool_]:
+    """[N], True where a point may be seen in one of the pixels ``wanted`` [M], flat, and where one of those needs it.
+
+    What a point is, its neighbours say, and theirs: points up to two pixels away in the image that they come from.
+    """
+    reach = math.ceil(RADIUS_LIMITS[1])
+    near = np.zeros((height + 2 * reach, width + 2 * reach), np.uint8)
+    near[wanted // width + reach, wanted % width + reach] = 1
+    near = np.asarray(cv2.dilate(near, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)))
+    u, v = np.floor(points_uv.T) + np.float32(reach)
+    inside = (u >= 0) & (u < near.shape[1]) & (v >= 0) & (v < near.shape[0])
+    seen = np.zeros(len(points_uv), bool)
+    seen[inside] = near[v[inside].astype(np.intp), u[inside].astype(np.intp)] > 0
+    needed = np.zeros(cloud.image.shape[1:], np.uint8)
+    needed[cloud.rows[seen], cloud.columns[seen]] = 1
+    return np.asarray(cv2.dilate(needed, np.ones((5, 5), np.uint8)))[cloud.rows, cloud.columns] > 0
+
+
+def _some(cloud: Cloud, kept: NDArray[np.bool_]) -> Cloud:
+    """The points of ``kept`` [N]."""
+    moving = cloud.points_xyz[kept], cloud.z_src[kept], cloud.image, cloud.step_xyz[kept]
+    return Cloud(*moving, cloud.rows[kept], cloud.columns[kept])
 
 
 def _transposed(matrix: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -229,19 +282,23 @@ def _origins(
     np.divide(seen[0] ** 2 + seen[1] ** 2 + edge, np.float32(_SQUARED), out=squared)
 
 
-def _colour(mean: NDArray[np.float32], image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[3, H, W]: of ``image`` where the surface was seen; where a pixel shows several, the mean of their colours."""
-    height, width = mean.shape[1:]
-    x, y = np.arange(width, dtype=np.float32) + np.float32(0.5), np.arange(height, dtype=np.float32) + np.float32(0.5)
-    y = y[:, None]
+def _colour(
+    mean: NDArray[np.float32], image: NDArray[np.float32], pixels: NDArray[np.intp], width: int
+) -> NDArray[np.float32]:
+    """[3, M]: of ``image`` where the surface was seen; where a pixel shows several, the mean of their colours.
+
+    ``mean`` is [16, M], of the ``pixels`` [M] of a view, flat.
+    """
+    y, x = (at.astype(np.float32) + np.float32(0.5) for at in np.divmod(pixels.astype(np.int32), np.int32(width)))
     start, slope, seen, squared = mean[7:9], mean[9:13], mean[13:15], mean[15] * np.float32(_SQUARED)
     u, v = start[0] + slope[0] * x + slope[1] * y, start[1] + slope[2] * x + slope[3] * y
     one = (u - seen[0]) ** 2 + (v - seen[1]) ** 2 < _EXTRAPOLATED**2
     one &= squared - seen[0] ** 2 - seen[1] ** 2 < _ONE_SURFACE**2
-    u -= np.float32(0.5)
-    v -= np.float32(0.5)
-    there = [cv2.remap(plane, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in image]
-    return np.where(one, np.stack(there), mean[:3])
+    maps = [np.pad(at - np.float32(0.5), (0, -len(at) % _ROW)).reshape(-1, _ROW) for at in (u, v)]
+    if not len(pixels):
+        return mean[:3]
+    there = [cv2.remap(plane, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel() for plane in image]
+    return np.where(one, np.stack(there)[:, : len(pixels)], mean[:3])
 
 
 def _surface(
