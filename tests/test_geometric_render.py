@@ -178,3 +178,18 @@ def test_rendered() -> None:
 def test_same_bits_twice() -> None:
     clouds, aside = (cloud_of(noise(), room()), cloud_of(noise(seed=1), flat(30))), pose(0.02, (0.3, 0, -0.8))
     assert np.array_equal(seen(*clouds, tgt_from_next=aside).planes, seen(*clouds, tgt_from_next=aside).planes)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.8, 0.2])
+def test_wanted_pixels_are_the_same_bits_as_in_the_whole_view(share: float) -> None:
+    """Of dense and sparse clouds, two of them; all else is 0. Pixels at the border and none at all are cases, too."""
+    rng = np.random.default_rng(3)
+    which = rng.random((HEIGHT, WIDTH)) < share
+    moved = pose(0.05, (0.4, 0.0, -0.5))
+    clouds = [cloud_of(noise(), room(), which=which, dst_from_src=moved), cloud_of(noise(seed=1), room())]
+    whole = show(clouds, K, EYE, HEIGHT, WIDTH)
+    for where in (rng.random((1, HEIGHT, WIDTH)) < 0.01, holes(whole), np.zeros((1, HEIGHT, WIDTH), bool)):
+        where[:, 0] = where.any()
+        some = show(clouds, K, EYE, HEIGHT, WIDTH, where=where)
+        assert np.array_equal(some.planes, np.where(where, whole.planes, 0))
+        assert np.array_equal(some.coverage, np.where(where, whole.coverage, 0))

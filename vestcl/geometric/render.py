@@ -109,10 +109,15 @@ def show(
     planes, left = np.zeros((7, len(wanted)), np.float32), np.ones(len(wanted), np.float32)
     uncovered = np.ones(len(wanted), np.float32)
     for cloud in clouds:
-        mean, coverage = _splat(cloud, K, tgt_from_next, height, width, None if where is None else wanted)
+        through = left > 0
+        pixels = _Wanted(height, width, None if where is None else wanted, None if through.all() else wanted[through])
+        mean, coverage = _splat(cloud, K, tgt_from_next, pixels)
         opacity = np.minimum(coverage / np.float32(_OPAQUE), 1) * (coverage > HOLE)
-        mean *= left * opacity
-        planes += mean
+        if pixels.coloured is None:
+            mean *= left * opacity
+            planes += mean
+        else:
+            planes[:, through] += mean * (left * opacity)[through]
         left *= 1 - opacity
         uncovered *= 1 - coverage
     planes /= np.maximum(1 - left, np.float32(1e-6))
@@ -124,57 +129,71 @@ def show(
     return Shown(both[:7], both[7:])
 
 
+@dataclass(frozen=True, eq=False)
+class _Wanted:
+    """The pixels of a view that are wanted, flat."""
+
+    height: int
+    width: int
+    covered: NDArray[np.intp] | None
+    """[M], whose coverage is; None = of all."""
+    coloured: NDArray[np.intp] | None
+    """[L], those of them whose colour is, too; None = of the same."""
+
+    def of_view(self) -> NDArray[np.intp] | None:
+        """Those whose colour is wanted; None = all."""
+        return self.covered if self.coloured is None else self.coloured
+
+
 def _splat(
-    cloud: Cloud,
-    K: NDArray[np.float64],
-    tgt_from_next: NDArray[np.float64],
-    height: int,
-    width: int,
-    wanted: NDArray[np.intp] | None,
+    cloud: Cloud, K: NDArray[np.float64], tgt_from_next: NDArray[np.float64], wanted: _Wanted
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """image [7, M], divided by coverage, and coverage [M], of the pixels ``wanted`` [M], flat; None = all."""
+    """image [7, L], divided by coverage, and coverage [M]."""
     still = np.zeros((1, *cloud.points_xyz.shape), np.float32)
     points_uv, z = vestcl.displace(
         cloud.points_xyz[None], still, K[None].astype(np.float32), tgt_from_next[None].astype(np.float32)
     )
-    if wanted is not None:
-        kept = _near(cloud, points_uv[0], wanted, height, width)
+    if wanted.covered is not None:
+        kept = _near(cloud, points_uv[0], wanted.covered, wanted)
         cloud, points_uv, z = _some(cloud, kept), points_uv[:, kept], z[:, kept]
-    pixels, distance = _Pixels.of(cloud), np.maximum(z[0], np.float32(1e-3))
-    zoom, uv = cloud.z_src / distance, _transposed(points_uv[0])
-    whole, stretch = _surface(pixels, uv, zoom)
+    zoom, uv = cloud.z_src / np.maximum(z[0], np.float32(1e-3)), _transposed(points_uv[0])
+    whole, stretch = _surface(_Pixels.of(cloud), uv, zoom)
     radii = np.clip(RHO * stretch, *RADIUS_LIMITS)[None]
     opacities = (whole & (RHO * zoom <= RADIUS_LIMITS[1]))[None].astype(np.float32)
-    features = np.empty((16, len(zoom)), np.float32)
+    size = wanted.height, wanted.width
+    image, coverage = vestcl.splat(points_uv, z, radii, opacities, _features(cloud, uv, z[0], whole)[None], *size)
+    composite, covered, pixels = image[0].transpose(1, 2, 0).reshape(-1, 16), coverage.ravel(), wanted.of_view()
+    mean = _transposed(composite if pixels is None else composite[pixels])
+    mean /= np.maximum(covered if pixels is None else covered[pixels], np.float32(1e-6))
+    mean[:3] = _colour(mean, cloud.image, pixels, *size)
+    return mean[:7], covered if wanted.covered is None else covered[wanted.covered]
+
+
+def _features(
+    cloud: Cloud, uv: NDArray[np.float32], z: NDArray[np.float32], whole: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """[N, 16]: colour 3, inverse depth, motion 3, and what `_origins` finds of points at ``uv`` [2, N], ``z`` [N]."""
+    pixels, distance = _Pixels.of(cloud), np.maximum(z, np.float32(1e-3), dtype=np.float32)
+    features = np.empty((16, len(z)), np.float32)
     features[:3] = pixels.colours(cloud.image)
     np.divide(1, distance, out=features[3])
     features[4:7] = _transposed(cloud.step_xyz)
-    _origins(cloud, pixels, uv, zoom, whole, features[7:])
-    image, coverage = vestcl.splat(points_uv, z, radii, opacities, _transposed(features)[None], height, width)
-    composite, covered = image[0].transpose(1, 2, 0).reshape(-1, 16), coverage.ravel()
-    if wanted is not None:
-        composite, covered = composite[wanted], covered[wanted]
-    mean = _transposed(composite)
-    mean /= np.maximum(covered, np.float32(1e-6))
-    mean[:3] = _colour(mean, cloud.image, np.arange(height * width) if wanted is None else wanted, width)
-    return mean[:7], covered
+    _origins(cloud, pixels, uv, np.divide(cloud.z_src, distance, dtype=np.float32), whole, features[7:])
+    return _transposed(features)
 
 
-def _near(
-    cloud: Cloud, points_uv: NDArray[np.float32], wanted: NDArray[np.intp], height: int, width: int
-) -> NDArray[np.bool_]:
-    """[N], True where a point may be seen in one of the pixels ``wanted`` [M], flat, and where one of those needs it.
+def _near(cloud: Cloud, points_uv: NDArray[np.float32], pixels: NDArray[np.intp], view: _Wanted) -> NDArray[np.bool_]:
+    """[N], True where a point may be seen in one of the ``pixels`` [M] of a view, flat, or where such a point needs it.
 
     What a point is, its neighbours say, and theirs: points up to two pixels away in the image that they come from.
     """
     reach = math.ceil(RADIUS_LIMITS[1])
-    near = np.zeros((height + 2 * reach, width + 2 * reach), np.uint8)
-    near[wanted // width + reach, wanted % width + reach] = 1
+    near = np.zeros((view.height + 2 * reach, view.width + 2 * reach), np.uint8)
+    near[pixels // view.width + reach, pixels % view.width + reach] = 1
     near = np.asarray(cv2.dilate(near, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)))
     u, v = np.floor(points_uv.T) + np.float32(reach)
-    inside = (u >= 0) & (u < near.shape[1]) & (v >= 0) & (v < near.shape[0])
-    seen = np.zeros(len(points_uv), bool)
-    seen[inside] = near[v[inside].astype(np.intp), u[inside].astype(np.intp)] > 0
+    inside = np.flatnonzero((u >= 0) & (u < near.shape[1]) & (v >= 0) & (v < near.shape[0]))
+    seen = inside[near[v[inside].astype(np.intp), u[inside].astype(np.intp)] > 0]
     needed = np.zeros(cloud.image.shape[1:], np.uint8)
     needed[cloud.rows[seen], cloud.columns[seen]] = 1
     return np.asarray(cv2.dilate(needed, np.ones((5, 5), np.uint8)))[cloud.rows, cloud.columns] > 0
@@ -283,22 +302,32 @@ def _origins(
 
 
 def _colour(
-    mean: NDArray[np.float32], image: NDArray[np.float32], pixels: NDArray[np.intp], width: int
+    mean: NDArray[np.float32], image: NDArray[np.float32], pixels: NDArray[np.intp] | None, height: int, width: int
 ) -> NDArray[np.float32]:
     """[3, M]: of ``image`` where the surface was seen; where a pixel shows several, the mean of their colours.
 
-    ``mean`` is [16, M], of the ``pixels`` [M] of a view, flat.
+    ``mean`` is [16, M], of the ``pixels`` [M] of a view, flat; None = of all.
     """
-    y, x = (at.astype(np.float32) + np.float32(0.5) for at in np.divmod(pixels.astype(np.int32), np.int32(width)))
+    row, half = width, np.float32(0.5)
+    if pixels is None:
+        x = np.tile(np.arange(width, dtype=np.float32) + half, height)
+        y = np.repeat(np.arange(height, dtype=np.float32) + half, width)
+    else:
+        row = _ROW
+        y, x = (at.astype(np.float32) + half for at in np.divmod(pixels, width))
     start, slope, seen, squared = mean[7:9], mean[9:13], mean[13:15], mean[15] * np.float32(_SQUARED)
     u, v = start[0] + slope[0] * x + slope[1] * y, start[1] + slope[2] * x + slope[3] * y
     one = (u - seen[0]) ** 2 + (v - seen[1]) ** 2 < _EXTRAPOLATED**2
     one &= squared - seen[0] ** 2 - seen[1] ** 2 < _ONE_SURFACE**2
-    maps = [np.pad(at - np.float32(0.5), (0, -len(at) % _ROW)).reshape(-1, _ROW) for at in (u, v)]
-    if not len(pixels):
+    if not mean.size:
         return mean[:3]
-    there = [cv2.remap(plane, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel() for plane in image]
-    return np.where(one, np.stack(there)[:, : len(pixels)], mean[:3])
+    u -= half
+    v -= half
+    across, down = (np.pad(at, (0, -len(at) % row)).reshape(-1, row) for at in (u, v))
+    there = [
+        cv2.remap(plane, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel() for plane in image
+    ]
+    return np.where(one, np.stack(there)[:, : len(u)], mean[:3])
 
 
 def _surface(
