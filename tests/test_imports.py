@@ -72,3 +72,18 @@ def test_importing_vestcl_loads_no_driver() -> None:
         "assert 'libpocl' in open('/proc/self/maps').read()"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_the_help_loads_neither_torch_nor_opencl() -> None:
+    """It is there in a quarter of a second; each of these takes a tenth or more."""
+    heavy = ("torch", "pyopencl", "numpy", "cv2", "scipy", "skimage", "matplotlib", "pandas")
+    script = f"""
+import contextlib, io, sys
+from vestcl.cli import main
+for command in ([], ["forecast"], ["devices"]):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        main([*command, "--help"])
+print([name for name in {heavy} if name in sys.modules])
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert ran.stdout.strip() == "[]"

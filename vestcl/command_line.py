@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
-from vestcl import interrupt, options, runtime
+from vestcl import interrupt, options
 
 #: Exit status of an error that the user can correct.
 REFUSED: Final = 2
@@ -102,9 +102,13 @@ def run(parse: Callable[[], Parsed], own: bool) -> int:
 
 def is_known(error: Exception) -> bool:
     """Whether ``error`` is one that the user can correct; other errors are vestcl's own, and need their traceback."""
-    if isinstance(error, RuntimeError) and not isinstance(error, runtime.DeviceError):
+    # Where nothing has loaded the module, which takes a tenth of a second, no error is from there.
+    runtime = sys.modules.get("vestcl.runtime")
+    if runtime is not None and isinstance(error, runtime.DeviceError):
+        return True
+    if isinstance(error, RuntimeError):
         return any(words in str(error) for words in _NO_MEMORY)
-    return isinstance(error, runtime.DeviceError | ValueError | OSError | MemoryError)
+    return isinstance(error, ValueError | OSError | MemoryError)
 
 
 def in_words(error: Exception) -> str:

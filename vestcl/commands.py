@@ -1,4 +1,7 @@
-"""What `vestcl COMMAND --help` lists: a dataclass a command, whose fields are its options. Torch is imported late."""
+"""What `vestcl COMMAND --help` lists: a dataclass a command, whose fields are its options.
+
+Torch and OpenCL are imported late: the help needs neither.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +13,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vestcl import doctor, runtime
 from vestcl.st_lpips import Option as StLpipsOption
 
 
@@ -20,6 +22,8 @@ class Devices:
 
     def run(self) -> int:
         """Print the table."""
+        from vestcl import runtime
+
         used = runtime.select()
         table = Table("", "index", box=box.SIMPLE, padding=0)
         table.add_column("device, platform, driver", overflow="fold")
@@ -47,6 +51,8 @@ class Doctor:
 
     def run(self) -> int:
         """Print what works; 0 if vestcl's default device does, else 1."""
+        from vestcl import doctor
+
         console = Console()
         with console.status("trying every OpenCL device"):
             report = doctor.examine(self.timeout)
@@ -91,7 +97,7 @@ class Demo:
 
     def run(self) -> int:
         """Write the pictures."""
-        from vestcl import demo
+        from vestcl import demo, runtime
 
         with runtime.use(self.device):
             demo.run(self.out, self.height, self.width, self.seed, self.model, self.quality)
