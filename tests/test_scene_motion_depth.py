@@ -119,6 +119,20 @@ def test_a_car_that_crosses_before_a_camera_at_rest_has_the_depth_of_its_foot() 
     assert np.abs(below / depth[0, 3 * HEIGHT // 4 + 20 :, WIDTH // 2] - 1).max() < 0.05, "the road keeps its depth"
 
 
+def test_a_cars_depth_ends_with_it() -> None:
+    images, depth = drive(ahead(step=0.0))
+    noise = np.random.default_rng(1).uniform(0.1, 0.9, (3, 24, 60)).astype(np.float32).repeat(2, 1).repeat(2, 2)
+    rows = slice(HEIGHT // 2 - 8, HEIGHT // 2 + 40)
+    for i, image in enumerate(images):
+        image[:] = 0.5 + 0.1 * (image - 0.5)  # few edges that depth would end at
+        image[:, rows, 40 + 5 * i : 160 + 5 * i] = noise
+    left, right = 40 + 5 * (len(images) - 1), 160 + 5 * (len(images) - 1)
+    found, beside = motion_depth(images, K), np.r_[left - 30 : left - 8, right + 8 : right + 30]
+    road = np.s_[0, HEIGHT // 2 + 20 : HEIGHT // 2 + 36, WIDTH // 2]
+    level = found.depth[0, HEIGHT // 2 + 20 : HEIGHT // 2 + 36][:, beside]
+    assert np.median(np.abs(level / depth[road][:, None] - 1)) < 0.05
+
+
 def test_a_wrong_start_does_not_decide_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     poses = ahead()
     images, _ = drive(poses)

@@ -43,3 +43,31 @@ def test_nothing_moves() -> None:
     image, _, car = crossing()
     match = Correspondence(np.zeros((2, HEIGHT, WIDTH), np.float32), np.zeros((1, HEIGHT, WIDTH), np.float32))
     assert not whole_objects(np.zeros_like(car), image, image, match, pixel_centres(HEIGHT, WIDTH)).any()
+
+
+def plain(image: np.ndarray, region: tuple[slice, slice]) -> np.ndarray:
+    image = image.copy()
+    image[(slice(None), *region)] = 0.5
+    return image
+
+
+def test_windows_that_look_the_same_in_both_images_go_with_their_car() -> None:
+    image, image_prev, car = crossing()
+    window, notch = np.s_[46:54, 130:142], np.s_[58:62, 168:180]  # the second one touches the outline
+    found = car.copy()
+    found[window] = found[notch] = False
+    images = [plain(plain(each, np.s_[44:56, 110:155]), np.s_[56:64, 155:196]) for each in (image, image_prev)]
+    flow = np.where(found, np.float32(-STEP), np.float32(0)) * np.array([1, 0], np.float32)[:, None, None]
+    match = Correspondence(flow, np.where(found == car, 0, 9).astype(np.float32)[None])
+    whole = whole_objects(found, *images, match, pixel_centres(HEIGHT, WIDTH))
+    assert whole[window].all() and whole[58:62, 168:176].all()
+
+
+def test_the_road_inside_a_ring_of_traffic_stays() -> None:
+    image, _, _ = crossing()
+    ring = np.zeros((HEIGHT, WIDTH), bool)
+    ring[10:86, 60:260] = True
+    ring[20:76, 70:250] = False
+    match = Correspondence(np.zeros((2, HEIGHT, WIDTH), np.float32), np.zeros((1, HEIGHT, WIDTH), np.float32))
+    whole = whole_objects(ring, image, image, match, pixel_centres(HEIGHT, WIDTH))
+    assert not whole[24:72, 74:246].any() and whole[ring].all()

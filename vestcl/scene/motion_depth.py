@@ -157,7 +157,10 @@ def _complete(measured: Measured, road: Array, image: NDArray[np.float32], motio
     guessed = np.isinf(spread)
     inverse = np.where(guessed, _ASIDE, inverse)
     weight = np.where(sky, 0, np.where(guessed, _ASIDE_COUNTS, believed))
-    inverse = motion_fill.smooth(inverse, weight, road, image)
-    depth = np.where(sky, SKY_DEPTH, 1 / np.clip(inverse, 1 / motion_fill.FAR, 1 / _NEAREST))
+    whole = motion_fill.smooth(inverse, weight, road, image)
+    if things.any():  # beyond an object its depth would hide what is farther as soon as the object has left
+        around = motion_fill.smooth(inverse, np.where(things > 0, 0, weight), road, image)
+        whole = np.where(things > 0 if at_rest else motion_fill.reach(things, veiled), whole, around)
+    depth = np.where(sky, SKY_DEPTH, 1 / np.clip(whole, 1 / motion_fill.FAR, 1 / _NEAREST))
     confidence = motion_fill.confidence_of(np.maximum(measured.inverse, 0), std)
     return MotionDepth(depth[None].astype(np.float32), motion, confidence[None].astype(np.float32))

@@ -32,6 +32,10 @@ _FOOT: Final = 0.6
 #: may be; what flow finds farther away there than so many 1/m is not believed, as the roof moves with the thing.
 _TALL, _WAIST, _VEILED_BELOW = 0.45, 0.5, 0.008
 
+#: While the camera drives objects' depths spread to pixels up to that share of the image's width from them: 4 px of 640
+#: are what flow misses of an outline.
+_RIM: Final = 0.006
+
 #: A measurement counts half if its standard deviation is that share of itself plus so many 1/m.
 _HALF_SHARE, _HALF = 0.15, 0.002
 
@@ -59,7 +63,8 @@ class Standing(NamedTuple):
 def standing(inverse: Array, std: Array, moving: NDArray[np.bool_], road: Array, at_rest: bool = False) -> Standing:
     """Things that are farther than the road behind them by their flow, or leave their epipolar line: they move.
 
-    A connected region of such pixels is one thing. It stands where its lowest pixels touch the road.
+    A connected region of such pixels is one object. It stands where its lowest pixels touch the road. While the camera
+    drives only parts of it are found, and it fills their convex hull; at rest its outline is known.
 
     Args:
         inverse: [H, W] 1/m, as measured.
@@ -76,7 +81,7 @@ def standing(inverse: Array, std: Array, moving: NDArray[np.bool_], road: Array,
         if area < _SMALLEST * labels.size:
             continue
         box = np.s_[y : y + height, x : x + width]
-        inside = _hull(labels[box] == label)
+        inside = labels[box] == label if at_rest else _hull(labels[box] == label)
         lowest = height - 1 - inside[::-1].argmax(0)
         foot = float(np.quantile(road[box][lowest, np.arange(width)], _FOOT))
         if foot <= _ROAD_END:
@@ -94,6 +99,20 @@ def _hull(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
     corners = cv2.convexHull(np.column_stack([x, y]).astype(np.int32))
     hull = cv2.fillConvexPoly(region.astype(np.uint8), corners, 1) > 0
     return hull if region.mean() >= _SOLID * hull.mean() else region
+
+
+def reach(things: NDArray[np.int32], veiled: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Where objects' depths may spread to: up to edges of the image close to them, and to what they veil.
+
+    Beyond is the road, or static background, which would hide them at their depth as soon as they drive away.
+
+    Args:
+        things: [H, W], 0 = none.
+        veiled: [H, W].
+    """
+    side = 2 * max(round(_RIM * things.shape[1]), 1) + 1
+    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    return np.asarray((cv2.dilate((things > 0).astype(np.uint8), brush) > 0) | veiled, np.bool_)
 
 
 def combine(inverse: Array, std: Array, road: Array) -> tuple[Array, Array]:

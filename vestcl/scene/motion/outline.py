@@ -26,6 +26,9 @@ _FLOW_ERROR: Final = 1.0
 #: second one on: noise of an image.
 _WINDOW, _OTHER, _NOISE = 5, 0.15, 0.006
 
+#: Gaps of a region of up to twice that share of the image's width are closed, holes of up to that share of its area.
+_GAP, _HOLE = 0.005, 0.004
+
 #: Pixels with less weight than that around are not added.
 _UNSEEN: Final = 0.05
 
@@ -41,6 +44,7 @@ def whole_objects(
 
     Pixel p is added if G(w (|I(p) - I_prev(b(p))| - |I(p) - I_prev(p + f)|)) / G(w) > NOISE, with G smoothing up to the
     edges of the image, and w = 0 where the object was in front of the background before, which then says nothing.
+    Small holes and narrow gaps are filled: there both motions may look alike.
 
     Args:
         moving: [H, W].
@@ -73,7 +77,21 @@ def whole_objects(
         smooth(_check.pixels(image), cv2.blur(plane, (_WINDOW, _WINDOW)))
         for plane in (seen * (by_background - by_object), seen)
     )
-    return moving | (band & (gain > _NOISE * np.maximum(share, _UNSEEN)))
+    return _without_holes(moving | (band & (gain > _NOISE * np.maximum(share, _UNSEEN))))
+
+
+def _without_holes(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """With all that it encloses, but for gaps of up to twice _GAP: windows and wheels go with their car.
+
+    What is enclosed is no larger than _HOLE: a ring of traffic does not take the road inside along.
+    """
+    radius = _GAP * region.shape[1]
+    side = 2 * round(radius) + 2  # so far beyond the border nothing is, and what touches it is not enclosed
+    closed = _eroded(_dilated(np.pad(region, side), radius), radius)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((~closed).astype(np.uint8), connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] <= _HOLE * region.size
+    small[0] = False
+    return np.asarray(region | (closed | small[labels])[side:-side, side:-side], np.bool_)
 
 
 def _difference(
