@@ -5,7 +5,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vestcl.scene.motion.backtest import Frame, backtest, by_step, candidates, coherent, mixed, residual_flow
+from vestcl.scene.motion.backtest import (
+    Frame,
+    backtest,
+    by_step,
+    candidates,
+    coherent,
+    held_together,
+    mixed,
+    residual_flow,
+)
 from vestcl.scene.parallax import pixel_centres
 
 HEIGHT, WIDTH, FOCAL, DEPTH = 64, 160, 100.0, 10.0
@@ -164,3 +173,18 @@ def test_what_no_candidate_explains_follows_its_surroundings() -> None:
     assert np.abs(found[0][window] - 5).max() < 0.6, "the window goes with its car"
     assert np.abs(found[0, 4:9] - 0).max() < 0.1 and np.abs(found[0, 22:28, 24:46] - 5).max() < 0.1
     assert np.abs(found[1]).max() < 1e-3
+
+
+def test_an_object_is_held_together() -> None:
+    objects = np.zeros((4, 6), np.int32)
+    objects[1:3, 1:5] = 1
+    errors = np.full((2, 4, 6), 1e-3, np.float32)
+    errors[0, 1, 1:5] = 4e-3  # the upper half of the object would follow the second candidate, the lower one the first
+    errors[1, 2, 1:5] = 4e-3
+    held = held_together(errors, objects)
+    assert np.array_equal(held[:, objects == 0], errors[:, objects == 0])
+    assert np.allclose(held[0, 1, 1:5], np.sqrt(4e-3 * 2e-3)) and np.allclose(held[0, 2, 1:5], np.sqrt(1e-3 * 2e-3))
+    positions = np.zeros((2, 2, 4, 6), np.float32)
+    positions[1, 0] = 10
+    torn, whole = (mixed(positions, each)[0] for each in (errors, held))
+    assert np.ptp(whole[1:3, 1]) < 0.85 * np.ptp(torn[1:3, 1]) > 0

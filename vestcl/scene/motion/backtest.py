@@ -159,6 +159,20 @@ def by_step(errors: Sequence[Array], by_flow: bool = False) -> tuple[Array, ...]
     return (*errors[:1], *later)
 
 
+def held_together(errors: Array, objects: NDArray[np.int32]) -> Array:
+    """sqrt(e m) [C, H, W], m the geometric mean of e over the object of a pixel: neighbours that mixed their candidates
+    each in its own way would tear it.
+
+    Args:
+        errors: e [C, H, W], above 0.
+        objects: [H, W], 0 = background, which keeps its errors.
+    """
+    logs, number = np.log(errors), objects.ravel()
+    count = np.maximum(np.bincount(number), 1)
+    means = np.stack([(np.bincount(number, plane.ravel()) / count)[objects] for plane in logs])
+    return np.where(objects > 0, np.exp((logs + means) / 2), errors).astype(np.float32)
+
+
 def mixed(positions: Array, errors: Array) -> Array:
     """sum_c w_c q_c [2, H, W] of ``positions`` [C, 2, H, W], by their ``errors`` [C, H, W]."""
     weights = (errors / errors.min(axis=0)) ** -_SHARPNESS
