@@ -141,6 +141,15 @@ def test_no_cracks_in_a_wall_that_turns_towards_the_camera() -> None:
     assert last - first > 0.5 * K[0, 0] and rows[:, first + 2 : last - 1].all()
 
 
+def test_no_cracks_in_the_road_that_comes_close() -> None:
+    """A road 1.5 m below, after 12 m: what was 17 m away is at the lower border, its rows 10 px apart."""
+    ray = np.broadcast_to(((np.arange(HEIGHT) + 0.5 - K[1, 2]) / K[1, 1])[:, None], (HEIGHT, WIDTH))
+    depth = np.where(ray > 0, 1.5 / np.maximum(ray, 1e-3), 1000).astype(np.float32)[None]
+    road = cloud_of(colour((1, 1, 1)), depth, which=ray > 0)
+    shown = seen(road, tgt_from_next=pose(xyz=(0.0, 0.0, -12.0)))
+    assert shown.coverage[0, HEIGHT // 2 + 5 :, 140:176].min() > 0.9
+
+
 def test_spray_is_suppressed() -> None:
     """The camera steps 0.7 m to the left, the box 20 px further than the wall: of the red, little is left between."""
     shown = seen(cloud_of(*edge_with_spray()), tgt_from_next=pose(xyz=(0.7, 0, 0)))

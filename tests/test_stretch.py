@@ -70,3 +70,17 @@ def test_refuses_other_shapes(session: runtime.Session) -> None:
         stretch(torch.zeros(1, 4, 5, 2), torch.zeros(1, 5, 4))
     with pytest.raises(ValueError, match="`points_uv` must be"):
         stretch(torch.zeros(1, 4, 5, 3), torch.zeros(1, 4, 5))
+
+
+def test_a_plane_along_the_motion_stays_whole_close_to_the_camera(
+    mapped_session: runtime.Session, dtype: torch.dtype
+) -> None:
+    rows = torch.arange(40, 80, dtype=dtype)  # of a road below the horizon, whose inverse depth grows with the row
+    magnified = 1 / (1 - rows / 100)  # up to 5, where rows come to lie up to 25 px apart
+    points_uv = torch.stack([torch.zeros(40, dtype=dtype), rows * magnified], dim=1)[None, :, None]
+    factor, opacity = stretch(points_uv, magnified[None, :, None])
+    assert opacity[0, 1:-1].all() and (factor[0, 1:-1, 0] > 0.9 * magnified[1:-1]).all()
+    points_uv[:, 31:, :, 1] += 60  # a jump: what is next to it has neighbours at one side
+    opacity = stretch(points_uv, magnified[None, :, None])[1][0, 1:-1, 0]
+    assert opacity.nonzero()[:, 0].tolist() == [i for i in range(38) if i not in (29, 30)]
+    assert_like_twin(stretch, reference.stretch, points_uv=points_uv, magnified=magnified[None, :, None])

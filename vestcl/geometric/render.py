@@ -284,7 +284,8 @@ def _origins(
     zoomed = pixels.laid_out(zoom)
     (a, c), (b, d) = ((beside(*step) - beside(-step[0], -step[1])) / np.float32(2) for step in ((0, 1), (1, 0)))
     growth, alike = a * d - b * c, 1 / np.maximum(zoomed, np.float32(1e-3))
-    longest, area = np.square(np.maximum(zoomed, np.float32(1))) * constants.TORN**2, zoomed**2
+    near, area = np.square(np.maximum(zoomed, np.float32(1))) * constants.TORN**2, zoomed**2
+    longest = np.maximum(near, _slanted(zoomed))
     whole = (a * a + c * c < longest) & (b * b + d * d < longest)
     whole &= (growth > _GROWTH[0] * area) & (growth < _GROWTH[1] * area)
     safe = np.where(whole, growth, np.float32(1))
@@ -351,9 +352,43 @@ def _surface(
     count = functools.reduce(np.add, ((beside[step] < near).view(np.uint8) for step in _AROUND))
     line = functools.reduce(np.fmin, (np.maximum(beside[y, x], beside[-y, -x]) for y, x in _AROUND[:4]))
     whole = (count >= _NEIGHBOURS) | (line < np.float32(_LINE**2) * limit)
-    gaps = np.fmin(beside[-1, 0], beside[1, 0]), np.fmin(beside[0, -1], beside[0, 1])
-    spacing = np.maximum(*(np.where(gap < near, gap, np.float32(0)) for gap in gaps))
+    spacing, slanted = np.zeros_like(near), _slanted(zoomed)
+    sheared = _between_lines(mine, at, near)
+    for (down, right), lines in zip(((1, 0), (0, 1)), sheared, strict=True):
+        pair = beside[-down, -right], beside[down, right]
+        gap, plane = np.fmin(*pair), np.maximum(*pair) < slanted
+        gap = np.where((gap < near) | plane, gap, np.float32(0))
+        spacing = np.maximum(spacing, np.where(lines < np.maximum(near, slanted), lines, gap))
+        whole |= plane
     return pixels.of_points(whole), pixels.of_points(np.maximum(zoomed, np.sqrt(spacing)))
+
+
+def _between_lines(
+    mine: NDArray[np.float32], at: Callable[[int, int], NDArray[np.float32]], near: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Squared distances between rows and between columns of one plane, px^2; infinite where there is none.
+
+    A road shears: the neighbour below moves aside as well, and another point of its row comes to lie below. Neighbours
+    on a line are of one plane if they are as far away, in opposite directions, and those across are ``near``.
+    """
+    flat, steps, bent = np.ones(near.shape, bool), [], np.float32(0.4**2)
+    for down, right in ((0, 1), (1, 0)):
+        after, before = at(down, right), at(-down, -right)
+        step, bend = (after - before) / np.float32(2), after + before - 2 * mine
+        flat &= np.square(bend).sum(0) < bent * np.square(step).sum(0)
+        steps.append(step)
+    (a, c), (b, d) = steps
+    area, far = np.square(a * d - b * c), np.float32(np.inf)
+    rows, columns = (
+        np.where(flat & (length < near), area / np.maximum(length, np.float32(1e-9)), far)
+        for length in (a * a + c * c, b * b + d * d)
+    )
+    return rows, columns
+
+
+def _slanted(zoom: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[N] px^2: the square of how far apart a plane that the camera moves along comes to lie."""
+    return np.square(np.float32(constants.SLANTED) * np.square(zoom))
 
 
 def rendered(shown: Shown, image: NDArray[np.float32]) -> Rendered:

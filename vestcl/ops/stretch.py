@@ -13,7 +13,7 @@ def stretch(points_uv: Array, magnified: Array) -> tuple[Array, Array]:
     """How much farther apart than magnified a picture's points come to lie, and which are torn from all neighbours.
 
         h = min(|uv - uv_left|, |uv - uv_right|),   v = min(|uv - uv_above|, |uv - uv_below|)
-        each counts where it is below TORN max(m, 1)
+        each counts where it is below TORN max(m, 1), or where both of its gaps are below SLANTED m^2
         factor = max(1, max(h, v) / m),   opacity = 1 where h or v counts or the picture is one pixel, else 0
 
     A surface that turns towards the camera is stretched by more than what it comes nearer by. Of the neighbours at
@@ -31,7 +31,7 @@ def stretch(points_uv: Array, magnified: Array) -> tuple[Array, Array]:
         ValueError: an argument of another kind, dtype or shape.
         DeviceError: no OpenCL device, or one without float64 where that is asked for.
 
-    Source: `constants.TORN`; Zwicker et al., Surface Splatting, SIGGRAPH 2001, has the footprint's general form.
+    Source: `constants.TORN`, `constants.SLANTED`; Zwicker et al., Surface Splatting, SIGGRAPH 2001, has the footprint's general form.
     """
     check(points_uv=(points_uv, "B H W 2"), magnified=(magnified, "B H W"))
     factor, opacity = _stretch(runtime.current(), as_array(points_uv), as_array(magnified))
@@ -48,6 +48,6 @@ def _stretch(session: runtime.Session, points_uv: np.ndarray, magnified: np.ndar
         sizes: list[runtime.Argument] = [np.int32(height), np.int32(width), chunk]
         with session.job() as job:
             arguments = [*sizes, job.read(points_uv), job.read(magnified), job.write(factor), job.write(opacity)]
-            defines = runtime.defines_for(magnified.dtype, TORN=str(constants.TORN))
+            defines = runtime.defines_for(magnified.dtype, TORN=str(constants.TORN), SLANTED=str(constants.SLANTED))
             job.launch("stretch.cl", "stretch", defines, (items, height, batch), arguments, (group, 1, 1))
     return factor, opacity
