@@ -84,3 +84,13 @@ def test_a_plane_along_the_motion_stays_whole_close_to_the_camera(
     opacity = stretch(points_uv, magnified[None, :, None])[1][0, 1:-1, 0]
     assert opacity.nonzero()[:, 0].tolist() == [i for i in range(38) if i not in (29, 30)]
     assert_like_twin(stretch, reference.stretch, points_uv=points_uv, magnified=magnified[None, :, None])
+
+
+def test_rows_of_a_road_are_no_farther_apart_at_its_sides(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
+    rows, columns = torch.arange(40, 70, dtype=dtype)[:, None], torch.arange(-100, 100, dtype=dtype)
+    magnified = (1 / (1 - rows / 100)).expand(30, 200)
+    points_uv = torch.stack([columns * magnified, rows * magnified], dim=2)[None]  # the sides' rows move outwards
+    factor, opacity = stretch(points_uv, magnified[None])
+    assert opacity[0, 1:-1].all()
+    torch.testing.assert_close(factor[0, 1:-1, 1:-1], magnified[1:-1, 1:-1], rtol=0.02, atol=0)
+    assert_like_twin(stretch, reference.stretch, points_uv=points_uv, magnified=magnified[None].contiguous())

@@ -17,10 +17,14 @@ TILE: Final = 16
 #: what it magnifies: less tears surfaces that turn towards the camera, more draws skins between things and background.
 TORN: Final = 2.5
 
-#: A plane along which the camera moves is stretched by the square of what it magnifies: close to the camera by more than
-#: TORN allows. Pixels that both neighbours of a line are no farther from than that square, times this, are of such a
-#: plane: magnification changes from pixel to pixel, and depths are inexact.
+#: A plane along which the camera moves is stretched by the square of what it magnifies: close to the camera by more
+#: than TORN allows. Pixels that both neighbours of a line are no farther from than that square, times this, are of such
+#: a plane: magnification changes from pixel to pixel, and depths are inexact.
 SLANTED: Final = 1.25
+
+#: Of a plane the steps to the neighbours at both sides differ by less than that share of their mean: those of a road
+#: 17 rows below the horizon by 0.26 where they come to lie ten times as far apart, those of noise by 1 and more.
+BENT: Final = 0.4
 
 #: Fragments whose alpha and transmittance the CPU backward keeps at a time, per tile. At least one
 #: point's largest footprint (TILE * TILE); 4096 keeps them in L1/L2 and a street tile in one segment.

@@ -371,7 +371,7 @@ def _between_lines(
     A road shears: the neighbour below moves aside as well, and another point of its row comes to lie below. Neighbours
     on a line are of one plane if they are as far away, in opposite directions, and those across are ``near``.
     """
-    flat, steps, bent = np.ones(near.shape, bool), [], np.float32(0.4**2)
+    flat, steps, bent = np.ones(near.shape, bool), [], np.float32(constants.BENT**2)
     for down, right in ((0, 1), (1, 0)):
         after, before = at(down, right), at(-down, -right)
         step, bend = (after - before) / np.float32(2), after + before - 2 * mine

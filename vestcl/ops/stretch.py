@@ -16,6 +16,9 @@ def stretch(points_uv: Array, magnified: Array) -> tuple[Array, Array]:
         each counts where it is below TORN max(m, 1), or where both of its gaps are below SLANTED m^2
         factor = max(1, max(h, v) / m),   opacity = 1 where h or v counts or the picture is one pixel, else 0
 
+    Rows of a plane shear: where the steps to both sides differ by less than BENT of their means r, from left to right,
+    and d, downwards, v is |r x d| / |r| as far as |r| counts and v is below the larger limit; h likewise.
+
     A surface that turns towards the camera is stretched by more than what it comes nearer by. Of the neighbours at
     either side the nearer one counts, of both directions the wider gap.
 
@@ -31,7 +34,8 @@ def stretch(points_uv: Array, magnified: Array) -> tuple[Array, Array]:
         ValueError: an argument of another kind, dtype or shape.
         DeviceError: no OpenCL device, or one without float64 where that is asked for.
 
-    Source: `constants.TORN`, `constants.SLANTED`; Zwicker et al., Surface Splatting, SIGGRAPH 2001, has the footprint's general form.
+    Source: `constants.TORN`, `SLANTED`, `BENT`; Zwicker et al., Surface Splatting, SIGGRAPH 2001, has the
+    footprint's general form.
     """
     check(points_uv=(points_uv, "B H W 2"), magnified=(magnified, "B H W"))
     factor, opacity = _stretch(runtime.current(), as_array(points_uv), as_array(magnified))
@@ -48,6 +52,7 @@ def _stretch(session: runtime.Session, points_uv: np.ndarray, magnified: np.ndar
         sizes: list[runtime.Argument] = [np.int32(height), np.int32(width), chunk]
         with session.job() as job:
             arguments = [*sizes, job.read(points_uv), job.read(magnified), job.write(factor), job.write(opacity)]
-            defines = runtime.defines_for(magnified.dtype, TORN=str(constants.TORN), SLANTED=str(constants.SLANTED))
+            limits = {name: str(getattr(constants, name)) for name in ("TORN", "SLANTED", "BENT")}
+            defines = runtime.defines_for(magnified.dtype, **limits)
             job.launch("stretch.cl", "stretch", defines, (items, height, batch), arguments, (group, 1, 1))
     return factor, opacity
