@@ -136,3 +136,12 @@ def test_kitti_in_time() -> None:
         densify(scan, image)
         took.append(time.perf_counter() - start)
     assert min(took) < LIMIT * 4 / min(cv2.getNumThreads(), 4)
+
+
+def test_a_roof_above_the_returns_is_in_pieces_of_one_depth() -> None:
+    depth, image = np.zeros((1, 64, 208), np.float32), np.full((3, 64, 208), 0.2, np.float32)
+    depth[:, 40::4] = np.linspace(5, 40, 208)
+    image += np.random.default_rng(0).normal(0, 0.03, image.shape).astype(np.float32)
+    found = densify(depth, image.clip(0, 1))[0]
+    assert len(np.unique(found[34])) < 70 and np.ptp(np.log(found[34])) > 1, "not one for each column"
+    assert len(np.unique(found[50])) > 190, "between returns it is as measured"

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree  # type: ignore[import-untyped]
 from vestcl.scene import _check
 from vestcl.scene.completion import smooth
 from vestcl.scene.layers import SKY_DEPTH
+from vestcl.scene.regions import mean_by_region, superpixels
 
 #: A return shines through a nearer surface if more than half of its nearest returns, so many, have inverse depths above
 #: its own by that ratio. Rows of a scan are about twice as far apart in the picture as returns in a row.
@@ -20,6 +21,10 @@ _NEIGHBOURS, _THROUGH, _ROW = 9, 0.8, 0.5
 #: 4.8 % with the nearest return.
 _STRENGTH, _EDGES = 2.0, 4.0
 
+#: Pixels of a superpixel in an image of 208 columns, and columns whose highest return counts together. On two windows
+#: of kitti_clip superpixels above the returns gain 0.1, 0.7 and 0.8 dB at t+1, t+3 and t+5.
+_AREA, _BESIDE = 40.0, 9
+
 #: The smoothed weight of returns below which a value is rounding error, and the nearest pixel's is taken.
 _REACHED: Final = 1e-9
 
@@ -28,7 +33,9 @@ def densify(depth: ArrayLike, image: ArrayLike, *, sky: ArrayLike | None = None)
     """Inverse depth by normalised edge-aware smoothing, G(s m) / G(m), with m = 1 at a return and 0 elsewhere.
 
     Returns that shine through a nearer surface are dropped first. Where no return reaches, as above all of them, the
-    nearest smoothed value goes on.
+    nearest smoothed value goes on. Above the highest return of its column a superpixel has one depth, the geometric
+    mean: what is measured below spreads upwards, and a roof between near and far would tear. Its sky counts, so that
+    what stands out against the sky, as a bridge, is farther than what is below it in the image.
 
     Args:
         depth: [1, H, W] m, 0 = no return.
@@ -47,7 +54,17 @@ def densify(depth: ArrayLike, image: ArrayLike, *, sky: ArrayLike | None = None)
     image = _check.planes("image", image, 3, depth)
     far = np.zeros(depth.shape, bool) if sky is None else _check.mask("sky", sky, depth)
     inverse = _without_shine_through(depth[0])
-    return np.where(far, np.float32(SKY_DEPTH), 1 / _spread(inverse, _check.pixels(image))[None])
+    spread = np.where(far, np.float32(SKY_DEPTH), 1 / _spread(inverse, _check.pixels(image))[None])
+    regions = superpixels(image, spread, area=_AREA)
+    whole = np.exp(mean_by_region(np.log(spread[0]), regions))
+    return np.where(~far & _above(depth[0] > 0), whole, spread)
+
+
+def _above(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[H, W], True above all returns of a pixel's column and those next to it."""
+    height = len(known)
+    highest = np.where(known.any(axis=0), known.argmax(axis=0), height)
+    return np.asarray(np.arange(height)[:, None] < ndimage.minimum_filter1d(highest, _BESIDE)[None])
 
 
 def _without_shine_through(depth: NDArray[np.float32]) -> NDArray[np.float32]:
