@@ -169,10 +169,14 @@ def test_what_no_candidate_explains_follows_its_surroundings() -> None:
     errors = np.full((2, 40, 80), 1e-5, np.float32)
     errors[(slice(None), *window)] = 0.03
     centres = pixel_centres(40, 80)
-    found = coherent(np.asarray(centres + way, np.float32), errors, image) - centres
+    moving = np.zeros((40, 80), bool)
+    moving[car] = True
+    found = coherent(np.asarray(centres + way, np.float32), errors, image, moving) - centres
     assert np.abs(found[0][window] - 5).max() < 0.6, "the window goes with its car"
     assert np.abs(found[0, 4:9] - 0).max() < 0.1 and np.abs(found[0, 22:28, 24:46] - 5).max() < 0.1
     assert np.abs(found[1]).max() < 1e-3
+    kept = coherent(np.asarray(centres + way, np.float32), errors, image, np.zeros_like(moving)) - centres
+    assert np.array_equal(kept, way), "static pixels keep their own motion"
 
 
 def test_an_object_is_held_together() -> None:

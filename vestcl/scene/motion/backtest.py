@@ -180,17 +180,18 @@ def mixed(positions: Array, errors: Array) -> Array:
     return np.asarray((weights[:, None] * positions).sum(axis=0), np.float32)
 
 
-def coherent(positions: Array, errors: Array, image: Array) -> Array:
-    """Positions of pixels that no candidate explains follow those around: p + (1 - t) d + t G(w d) / G(w), d = q - p.
+def coherent(positions: Array, errors: Array, image: Array, moving: NDArray[np.bool_]) -> Array:
+    """Positions on objects that no candidate explains follow those around: p + (1 - t) d + t G(w d) / G(w), d = q - p.
 
-    t = e / (e + UNEXPLAINED) and w = 1 / (e + 1e-4), with e the least error of the candidates and G a smoother that
-    keeps to the image's edges. Windows and roofs, of which scans and stereo know no depth and flow nothing reliable,
-    so stay with their car.
+    t = G(m) e / (e + UNEXPLAINED) and w = 1 / (e + 1e-4), with e the least error of the candidates, m = 1 where
+    something moves, and G a smoother that keeps to the image's edges. Windows and roofs, of which scans and stereo know
+    no depth and flow nothing reliable, so stay with their car.
 
     Args:
         positions: q [2, H, W] px, from `mixed`.
         errors: [C, H, W].
         image: [3, H, W] RGB in [0, 1], of the frame that is moved.
+        moving: [H, W], what is not static.
 
     Returns:
         [2, H, W] px.
@@ -199,7 +200,7 @@ def coherent(positions: Array, errors: Array, image: Array) -> Array:
     way, guide, weight = (positions - centres).astype(np.float32), _check.pixels(image), 1 / (least + np.float32(1e-4))
     share = np.maximum(smooth(guide, weight), np.float32(1e-6))
     around = np.stack([smooth(guide, weight * part) / share for part in way])
-    unexplained = least / (least + np.float32(_UNEXPLAINED))
+    unexplained = smooth(guide, moving.astype(np.float32)).clip(0, 1) * least / (least + np.float32(_UNEXPLAINED))
     return np.asarray(positions + unexplained * (around - way), np.float32)
 
 
