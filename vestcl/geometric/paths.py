@@ -47,7 +47,7 @@ class Paths:
             return np.tensordot(future_from_cur[:3, :3], points, 1) + future_from_cur[:3, 3, None, None]
         positions, depth = backtest.candidates(self.frame, self._residual, future_from_cur, ahead, self.by_flow)
         errors = self.errors[0] if ahead <= 1 else self.errors[-1]
-        moving = self.frame.velocity.any(axis=0)
+        moving = np.asarray(self.frame.velocity.any(axis=0))
         u, v = backtest.coherent(backtest.mixed(positions, errors), errors, self.frame.image, moving)
         return np.stack([row[0] * u + row[1] * v + row[2] for row in np.linalg.inv(self.frame.K)]) * depth
 

@@ -200,7 +200,8 @@ def coherent(positions: Array, errors: Array, image: Array, moving: NDArray[np.b
     way, guide, weight = (positions - centres).astype(np.float32), _check.pixels(image), 1 / (least + np.float32(1e-4))
     share = np.maximum(smooth(guide, weight), np.float32(1e-6))
     around = np.stack([smooth(guide, weight * part) / share for part in way])
-    unexplained = smooth(guide, moving.astype(np.float32)).clip(0, 1) * least / (least + np.float32(_UNEXPLAINED))
+    alive = smooth(guide, moving.astype(np.float32)).clip(0, 1)
+    unexplained = alive * least / (least + np.float32(_UNEXPLAINED))
     return np.asarray(positions + unexplained * (around - way), np.float32)
 
 
