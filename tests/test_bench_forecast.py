@@ -1,5 +1,6 @@
 """`vestcl bench forecast`: truth formulas by construction, means on known numbers, and whole runs on tiny streets."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from onnx_files import write_mix
 from st_lpips_weights import public_state
 
 from vestcl import cli, metrics, peer, perceptual
@@ -264,3 +266,12 @@ def test_pooled_inputs_share_a_table() -> None:
     config = ForecastBench(("street:4", "street:5"), **TINY, pool=True)
     (group,) = running.groups_of(config)
     assert [clip.name for clip, _ in group.clips] == ["street 4", "street 5"]
+
+
+def test_a_network_gives_depth(tmp_path: Path) -> None:
+    network = write_mix(tmp_path / "network.onnx", [[0.0] * 3], bias=[7.0], metres=1)
+    config = ForecastBench(("street:1100",), street_size=(48, 96), street_frames=4, depth_model=str(network), steps=1)
+    ((clip, chosen),) = running.groups_of(config)[0].clips
+    assert chosen == [1, 2] and np.allclose(clip[1].read_depth(), 7, rtol=1e-5)
+    with pytest.raises(ValueError, match=r"nothing\.onnx"):
+        running.groups_of(dataclasses.replace(config, depth_model=str(tmp_path / "nothing.onnx")))

@@ -42,6 +42,11 @@ class ForecastBench:
     """Pixels."""
     views: tuple[Literal["source", "right"], ...] = ("source", "right")
     """Cameras to be judged from; right only where a clip has one."""
+    depth_model: str | None = None
+    """Estimate depth by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
+    huggingface.co."""
+    mask_model: str | None = None
+    """Estimate classes by this network, alike."""
     squeeze: Path | None = None
     """SqueezeNet 1.0 weights, for the distance in its features."""
     st_lpips: StLpipsOption = None

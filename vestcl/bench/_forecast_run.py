@@ -19,6 +19,7 @@ from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.forecast import View
 from vestcl.forecast_checks import check_input
+from vestcl.forecast_command import load_estimators, with_estimates
 from vestcl.geometric import Perception
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.trunks import Trunk
@@ -69,9 +70,9 @@ def groups_of(config: ForecastBench) -> list[Group]:
         ValueError: as `clips_of`; a clip that the list of windows lacks.
     """
     listed = None if config.windows is None else read_list(config.windows)
-    groups = []
+    groups, estimators = [], load_estimators(config.depth_model, config.mask_model)
     for text in config.inputs:
-        clips = clips_of(text, config)
+        clips = [with_estimates(clip, estimators) for clip in clips_of(text, config)]
         chosen = [(clip, chosen_windows(clip, config, listed)) for clip in clips]
         use = "" if listed is None else listed[clips[0].name].use
         groups.append(Group(text, chosen, use))
