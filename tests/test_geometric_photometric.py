@@ -74,6 +74,13 @@ def test_a_parked_car_stands_whatever_flow_says(grain: float) -> None:
     assert not found((0.0, 0.0, 0.0), np.array([[0.0, 0, 0], [2.4, 0.0, -2.1]]), grain).any()
 
 
+@pytest.mark.parametrize("v", [(0.0, 0.0, -5.6), (4.6, 0.0, 0.5)])
+def test_impossible_speeds_are_not_believed(v: tuple[float, float, float]) -> None:
+    """Half of the way to the camera, or 46 m/s aside, within a frame: they burst in the next one."""
+    velocity = found(v, np.stack([STILL[0], np.array(v)]))
+    assert np.linalg.norm(velocity[1]) < 4.5 and velocity[1, 2] > -0.5 * BOX_DEPTH
+
+
 def test_what_creeps_stands() -> None:
     assert not found((0.0, 0.0, 0.03)).any()
 

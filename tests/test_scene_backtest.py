@@ -14,6 +14,7 @@ from vestcl.scene.motion.backtest import (
     held_together,
     mixed,
     residual_flow,
+    untested,
 )
 from vestcl.scene.parallax import pixel_centres
 
@@ -192,3 +193,14 @@ def test_an_object_is_held_together() -> None:
     positions[1, 0] = 10
     torn, whole = (mixed(positions, each)[0] for each in (errors, held))
     assert np.ptp(whole[1:3, 1]) < 0.85 * np.ptp(torn[1:3, 1]) > 0
+
+
+def test_two_frames_mix_velocity_and_residual_flow() -> None:
+    depth = np.full((1, 8, 12), 5.0, np.float32)
+    one = np.ones((3, 8, 12), np.float32)
+    frame = Frame(one, depth, 0 * one, 0 * one[:2], np.eye(4), np.diag([10.0, 10.0, 1.0]))
+    errors = untested(frame)
+    assert errors.shape == (4, 8, 12)
+    positions = np.stack([np.full((2, 8, 12), value, np.float32) for value in (2.0, 50.0, 4.0, 90.0)])
+    np.testing.assert_allclose(mixed(positions, errors), 3.0, atol=1e-5)
+    assert len(untested(frame, by_flow=True)) == 5

@@ -74,6 +74,8 @@ def _tested_paths(perception: Perception, index: int) -> Paths:
         positions, _ = backtest.candidates(before, backtest.residual_flow(before), camera, ahead, by_flow)
         flows = [perception.correspondence(i).flow_uv for i in range(index, first, -1)]
         errors.append(backtest.backtest(positions, before, perception.image(index), flows))
+    if index == 1:
+        errors = [backtest.untested(perception.frame(index), by_flow)]
     objects = perception.seen(index).things
     held = [backtest.held_together(each, objects) for each in backtest.by_step(errors, by_flow)]
     return Paths(perception.frame(index), tuple(held), by_flow)

@@ -138,6 +138,17 @@ def backtest(positions: Array, before: Frame, after: Array, flows: Sequence[Arra
     return np.stack(errors)
 
 
+def untested(frame: Frame, by_flow: bool = False) -> Array:
+    """Errors [C, H, W] of candidates that nothing could test, where two frames are all: velocity and residual flow alike.
+
+    Args:
+        frame: that is looked at.
+        by_flow: as in `candidates`.
+    """
+    alike = np.array([1, 1e3, 1, 1e3, *[1e3] * by_flow], np.float32) * np.float32(1e-4)
+    return np.broadcast_to(alike[:, None, None], (len(alike), *frame.depth.shape[1:])).copy()
+
+
 def by_step(errors: Sequence[Array], by_flow: bool = False) -> tuple[Array, ...]:
     """Errors that count for the first step, and for all later ones: there the geometric mean over all tests.
 
