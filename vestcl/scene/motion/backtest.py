@@ -139,7 +139,7 @@ def backtest(positions: Array, before: Frame, after: Array, flows: Sequence[Arra
 
 
 def untested(frame: Frame, by_flow: bool = False) -> Array:
-    """Errors [C, H, W] of candidates that nothing could test, where two frames are all: velocity and residual flow alike.
+    """Errors [C, H, W] where nothing could be tested, as there are two frames only: velocity and residual flow mix.
 
     Args:
         frame: that is looked at.
