@@ -83,6 +83,20 @@ def test_a_clips_motions_have_one_scale(monkeypatch: pytest.MonkeyPatch) -> None
     assert lengths[-1] == own[-1] and np.ptp(own) > 0.4 * own[-1]
 
 
+def test_without_a_ratio_of_speeds_the_motion_before_is_as_fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the first moment of a drive, of an unknown scale after a rest, is forecast as a violent start."""
+    images, _ = drive([along(0.4 * max(i - 2, 0)) for i in range(4)])
+    samples = [Sample.from_arrays(f"{i}", image, K) for i, image in enumerate(images)]
+    made = motion_depth
+    monkeypatch.setattr(
+        perception, "motion_depth", lambda *args, **options: made(*args, **options)._replace(speed_before=0.0)
+    )
+    seen = perception.Perception(Clip("corridor", "memory", tuple(samples)))
+    assert not seen.prev_from_cur(2)[:3, 3].any()
+    before, last = seen.motions([2, 3])
+    assert last[:3, 3].any() and np.array_equal(before[:3, 3], last[:3, 3])
+
+
 def test_same_frames_same_bits() -> None:
     images, _ = drive(ahead())
     first, second = motion_depth(images, K), motion_depth(images, K)

@@ -156,14 +156,21 @@ class Perception:
         """`prev_from_cur` of consecutive frames, all in the scale of the last one where depth comes from motion.
 
         There each frame's road gives it a scale of its own; parallax over three images gives the ratio of their speeds.
+        Where it does not, as in the first moment of a drive, the motion before is taken to be as fast.
 
         Args:
             indices: of the frames, rising by one.
         """
-        motions, scale = [self.prev_from_cur(i).copy() for i in indices], 1.0
-        for motion, later in zip(motions[-2::-1], list(indices)[:0:-1], strict=True):
-            scale *= self.scale_before(later)
-            motion[:3, 3] *= scale
+        motions = [self.prev_from_cur(i).copy() for i in indices]
+        for motion, before, index in zip(motions[:0:-1], motions[-2::-1], list(indices)[:0:-1], strict=True):
+            if not self._is_from_motion(index) or not motion[:3, 3].any():
+                continue
+            length, length_before = (float(np.linalg.norm(each[:3, 3])) for each in (motion, before))
+            ratio = self._from_motion(index).speed_before
+            if not ratio:
+                before[:3, 3] = motion[:3, 3]
+            elif length_before:
+                before[:3, 3] *= ratio * length / length_before
         return motions
 
     def scale_before(self, index: int) -> float:
