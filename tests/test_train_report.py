@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -141,6 +142,7 @@ def test_no_number_is_null(tmp_path: Path) -> None:
 def test_scalars_and_images_appear(tmp_path: Path) -> None:
     """TensorBoard reads what was written; a resumed run's steps replace those that are made again."""
     report(tmp_path, [1.0] * 6)
+    time.sleep(1.1)  # TensorBoard orders files by the second that they were begun in
     report(tmp_path, [2.0] * 4, begin=4)
     events = event_accumulator.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     scalars = [(event.step, event.value) for event in events.Scalars("training/loss")]
