@@ -186,19 +186,13 @@ def _shown(paths: Paths, own: NDArray[np.bool_]) -> MovingCloud:
     """All pixels of the current frame; those of the recording car, ``own`` [1, H, W], stay in its camera's axes."""
     frame, (rows, columns) = paths.frame, np.indices(own.shape[1:]).reshape(2, -1)
     z_src = frame.depth.reshape(-1).astype(np.float32)
-    now, points = paths.at(0, np.eye(4)), dict[int, NDArray[np.float32]]()
+    now = paths.at(0, np.eye(4))
 
-    def points_at(step: int, future_from_cur: list[NDArray[np.float64]]) -> NDArray[np.float32]:
-        if step not in points:
-            moved = np.where(own, now, paths.at(step, future_from_cur[step]))
-            points[step] = np.asarray(cv2.transpose(moved.astype(np.float32).reshape(3, -1)))
-        return points[step]
+    def moved(step: int, future_from_cur: NDArray[np.float64]) -> NDArray[np.float32]:
+        points = np.where(own, now, paths.at(step, future_from_cur))
+        return np.asarray(cv2.transpose(points.astype(np.float32).reshape(3, -1)))
 
-    def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
-        there, before = (points_at(k, future_from_cur) for k in (step, step - 1))
-        return Cloud(there, z_src, frame.image, there - before, rows, columns)
-
-    return at
+    return _moving(moved, z_src, frame.image, rows, columns)
 
 
 def _cloud(
@@ -222,43 +216,35 @@ def _cloud(
         points = _transform(cur_from_src, points + elapsed * speed)
         speed = speed @ cur_from_src[:3, :3].T
     z_src = z.astype(np.float32)
-
-    moved = _kept_steps(lambda k, future_from_cur: _transform(future_from_cur, points + k * speed))
-
-    def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
-        there, before = (moved(k, future_from_cur[k]) for k in (step, step - 1))
-        return Cloud(there.astype(np.float32), z_src, image, (there - before).astype(np.float32), y, x)
-
-    return at
+    return _moving(lambda k, camera: _transform(camera, points + k * speed), z_src, image, y, x)
 
 
-def _kept_steps(
-    moved: Callable[[int, NDArray[np.float64]], NDArray[np.float64]],
-) -> Callable[[int, NDArray[np.float64]], NDArray[np.float64]]:
-    """``moved`` that keeps its last two results: a step's points are the next one's points before."""
-    kept: dict[int, NDArray[np.float64]] = {}
+def _static(memory: Memory) -> MovingCloud:
+    """What is remembered, at rest in the world."""
+    pixels = memory.rows, memory.columns
+    return _moving(lambda k, camera: _transform(camera, memory.points_xyz), memory.z_src, memory.image, *pixels)
 
-    def at(step: int, future_from_cur: NDArray[np.float64]) -> NDArray[np.float64]:
+
+def _moving(
+    moved: Callable[[int, NDArray[np.float64]], NDArray[np.floating]],
+    z_src: NDArray[np.float32],
+    image: NDArray[np.float32],
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+) -> MovingCloud:
+    """A cloud whose points [N, 3] are ``moved(step, future_from_cur)``: a step's are the next one's points before."""
+    kept: dict[int, NDArray[np.floating]] = {}
+
+    def points_at(step: int, future_from_cur: NDArray[np.float64]) -> NDArray[np.floating]:
         if step not in kept:
             for earlier in [k for k in kept if k < step - 1]:
                 del kept[earlier]
             kept[step] = moved(step, future_from_cur)
         return kept[step]
 
-    return at
-
-
-def _static(memory: Memory) -> MovingCloud:
-    """What is remembered, at rest in the world."""
-
-    moved = _kept_steps(lambda k, future_from_cur: _transform(future_from_cur, memory.points_xyz))
-
     def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
-        there, before = (moved(k, future_from_cur[k]) for k in (step, step - 1))
-        seen_at = memory.z_src, memory.image
-        return Cloud(
-            there.astype(np.float32), *seen_at, (there - before).astype(np.float32), memory.rows, memory.columns
-        )
+        there, before = (points_at(k, future_from_cur[k]) for k in (step, step - 1))
+        return Cloud(there.astype(np.float32), z_src, image, (there - before).astype(np.float32), rows, columns)
 
     return at
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vestcl.geometric.perception import Perception, Surface
 from vestcl.scene.exposure import STRIDE, nearest, tone_curve
 from vestcl.scene.layers import SKY_DEPTH
+from vestcl.scene.morphology import dilated
 from vestcl.scene.motion_plane import linear
 
 #: Frames before t-1 that are remembered if nothing else is asked for; `docs/memory.md` has the figures.
@@ -143,9 +144,7 @@ def _leave(perception: Perception, index: int) -> _Kept:
 
 def _static(frame: Surface) -> Bools:
     """[1, H, W], True = static, away from the foreground and the recording car."""
-    side = 2 * max(1, round(_DILATE * frame.own.shape[2] / _WIDTH)) + 1
-    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    return cv2.dilate((~frame.mask | frame.own)[0].astype(np.uint8), brush)[None] == 0
+    return ~dilated((~frame.mask | frame.own)[0], _DILATE * frame.own.shape[2] / _WIDTH)[None]
 
 
 def _even(depth: Array) -> Bools:

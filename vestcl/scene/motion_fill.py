@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.scene import _check, completion
+from vestcl.scene.morphology import dilated
 from vestcl.scene.motion_mask import without_specks
 
 #: Off the road: by more standard deviations than that, and by more than that share of the road's inverse depth.
@@ -110,9 +111,7 @@ def reach(things: NDArray[np.int32], veiled: NDArray[np.bool_]) -> NDArray[np.bo
         things: [H, W], 0 = none.
         veiled: [H, W].
     """
-    side = 2 * max(round(_RIM * things.shape[1]), 1) + 1
-    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    return np.asarray((cv2.dilate((things > 0).astype(np.uint8), brush) > 0) | veiled, np.bool_)
+    return dilated(things > 0, _RIM * things.shape[1]) | veiled
 
 
 def combine(inverse: Array, std: Array, road: Array) -> tuple[Array, Array]:

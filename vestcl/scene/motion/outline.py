@@ -14,6 +14,7 @@ from vestcl.scene import _check
 from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import Correspondence, sample
 from vestcl.scene.exposure import as_exposed
+from vestcl.scene.morphology import dilated, eroded
 from vestcl.scene.parallax import pixel_centres
 
 #: Asked are pixels up to that share of the image's width from a region. Flow of an object is taken from so far inside.
@@ -57,8 +58,8 @@ def whole_objects(
         [H, W].
     """
     width = moving.shape[1]
-    inner = _eroded(moving, _INSIDE * width) & (correspondence.error[0] < _FLOW_ERROR)
-    band = _dilated(moving, _BAND * width) & ~moving
+    inner = eroded(moving, _INSIDE * width) & (correspondence.error[0] < _FLOW_ERROR)
+    band = dilated(moving, _BAND * width) & ~moving
     if not inner.any() or not band.any():
         return moving
     _, nearest = cv2.distanceTransformWithLabels(
@@ -72,7 +73,7 @@ def whole_objects(
         _difference(image, before, there) for there in (background_uv, pixel_centres(*moving.shape) + flow_uv)
     )
     x, y = background_uv - flow_uv - 0.5
-    seen = 1 - sample(_dilated(moving, _INSIDE * width)[None].astype(np.float32), x, y, outside=0.0)[0]
+    seen = 1 - sample(dilated(moving, _INSIDE * width)[None].astype(np.float32), x, y, outside=0.0)[0]
     gain, share = (
         smooth(_check.pixels(image), cv2.blur(plane, (_WINDOW, _WINDOW)))
         for plane in (seen * (by_background - by_object), seen)
@@ -87,7 +88,7 @@ def _without_holes(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """
     radius = _GAP * region.shape[1]
     side = 2 * round(radius) + 2  # so far beyond the border nothing is, and what touches it is not enclosed
-    closed = _eroded(_dilated(np.pad(region, side), radius), radius)
+    closed = eroded(dilated(np.pad(region, side), radius), radius)
     _, labels, stats, _ = cv2.connectedComponentsWithStats((~closed).astype(np.uint8), connectivity=4)
     small = stats[:, cv2.CC_STAT_AREA] <= _HOLE * region.size
     small[0] = False
@@ -100,16 +101,3 @@ def _difference(
     found = sample(before, uv[0] - 0.5, uv[1] - 0.5, outside=np.nan)
     difference = np.nan_to_num(np.abs(found - image).mean(0), nan=_OTHER)
     return np.minimum(difference, np.float32(_OTHER))
-
-
-def _brush(radius: float) -> NDArray[np.uint8]:
-    side = 2 * max(round(radius), 1) + 1
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
-
-
-def _eroded(region: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    return cv2.erode(region.astype(np.uint8), _brush(radius)) > 0
-
-
-def _dilated(region: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    return cv2.dilate(region.astype(np.uint8), _brush(radius)) > 0
