@@ -11,6 +11,7 @@ from forecaster_scenes import SMALL, stir
 from geometric_scenes import turned
 from numpy.typing import NDArray
 from test_network_input import prepared
+from test_train_data import FakeClip
 from torch import nn
 from train_scenes import MODELS, configured, street
 
@@ -36,20 +37,15 @@ BOUNDED = dataclasses.replace(
 )
 
 
-class Driving:
+class Driving(FakeClip):
     """A bend that is driven faster and faster; motions are asked for one by one."""
 
-    size, name, right_camera = (8, 12), "driving", None
+    right_camera = None
 
     def __init__(self, interval: float | None, frames: int = 9, by_flow: bool = False) -> None:
-        self.interval, self.frames, self.read = interval, frames, list[int]()
+        super().__init__(frames, name="driving")
+        self.interval, self.read = interval, list[int]()
         self.inputs = Inputs("motion", "motion", "optical flow" + ("" if by_flow else " and depth"), "regions")
-
-    def __len__(self) -> int:
-        return self.frames
-
-    def is_whole(self, index: int, steps: int) -> bool:
-        return index + steps < self.frames
 
     def elapsed(self, index: int) -> float:
         return 1.0
@@ -64,21 +60,6 @@ class Driving:
 
     def frame(self, index: int) -> Prepared:
         return prepared(index, self.motion(index) if index else None)
-
-    def image(self, index: int) -> np.ndarray:
-        return self.frame(index).layers.image
-
-    def right(self, index: int) -> None:
-        return None
-
-    def K(self, index: int) -> np.ndarray:  # noqa: N802 - as PreparedClip has it
-        return prepared(index, None).K
-
-    def world_from_cam(self, index: int) -> None:
-        return None
-
-    def frame_name(self, index: int) -> str:
-        return f"{index:03}"
 
 
 def windows(*clips: Driving, **settings: Any) -> WindowSet:
