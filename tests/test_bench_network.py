@@ -12,10 +12,10 @@ from rich.console import Console
 from vestcl.bench import network
 from vestcl.bench._timing import Spread
 from vestcl.bench.network import NetworkBench, Part, Stopwatch, TimedForecaster, Timing
+from vestcl.constants import SKY_DEPTH
 from vestcl.data.raycast import SKY_DEPTH as STREET_SKY
 from vestcl.models import configuration
 from vestcl.models.forecaster import Forecaster
-from vestcl.scene.layers import SKY_DEPTH
 
 TINY: dict[str, Any] = {"height": 32, "width": 64, "runs": 2}
 

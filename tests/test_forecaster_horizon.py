@@ -20,9 +20,9 @@ from forecaster_scenes import (
 from torch import nn
 from torch.nn import functional
 
+from vestcl.constants import SKY_DEPTH
 from vestcl.models import EgoMotion, ObjectMotion
 from vestcl.models.forecaster import Forecaster, Step
-from vestcl.scene.layers import SKY_DEPTH
 
 # ---------------------------------------------------------------- horizons, and what is shown
 

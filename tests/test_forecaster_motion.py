@@ -5,12 +5,12 @@ import itertools
 import torch
 from forecaster_scenes import ABLATIONS, FOCAL, SHARP, TINY, camera, drive, frame, pair_of, push, sides_of, wall
 
+from vestcl.constants import SKY_DEPTH
 from vestcl.models import EgoMotion, ObjectMotion
 from vestcl.models._frames import grid_depth, grid_mean
 from vestcl.models._render import Side, compose_view
 from vestcl.models.config import FIXED_DEPTH, LEAST_COVERAGE, LOG_DEPTH_FAR
 from vestcl.models.forecaster import Forecaster
-from vestcl.scene.layers import SKY_DEPTH
 
 # ---------------------------------------------------------------- by hand
 

@@ -8,10 +8,11 @@ from forecaster_scenes import ABLATIONS, SHARP, TINY, camera, drive, frame, pair
 from torch.nn import functional
 
 from vestcl import geometry
+from vestcl.constants import SKY_DEPTH
 from vestcl.models._clouds import Cloud, advance
 from vestcl.models._perceive import perceive_forecast
 from vestcl.models.forecaster import Forecaster
-from vestcl.scene.layers import SKY_DEPTH, LayerBatch
+from vestcl.scene.layers import LayerBatch
 
 # ---------------------------------------------------------------- further on
 

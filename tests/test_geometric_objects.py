@@ -18,9 +18,9 @@ from geometric_scenes import (
     with_noise,
 )
 
+from vestcl.constants import SKY_DEPTH
 from vestcl.geometric.objects import follow_flow, segment, velocities
 from vestcl.scene.correspondence import Correspondence
-from vestcl.scene.layers import SKY_DEPTH
 
 #: Of the inverse depth, 1/m.
 INVERSE_STD = 0.002

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from geometric_scenes import HEIGHT, WIDTH, drive
 
+from vestcl.constants import SKY_DEPTH
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DepthArray, DepthFile, ImageArray
 from vestcl.forecast import View
 from vestcl.geometric.forecast import forecast_frames, input_notes
 from vestcl.geometric.perception import Perception
-from vestcl.scene.layers import SKY_DEPTH
 
 #: A frame with another on either side.
 FRAME = 2

@@ -7,10 +7,10 @@ import pytest
 import torch
 from forecaster_scenes import SMALL, TINY
 
+from vestcl.constants import SKY_DEPTH
 from vestcl.io.labels import SKY
 from vestcl.later_frames import later_frames
 from vestcl.models.forecaster import perceive_estimated, perceive_forecast
-from vestcl.scene.layers import SKY_DEPTH
 
 CAR, ROAD = 13, 0
 

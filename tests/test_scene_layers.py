@@ -8,7 +8,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from vestcl.scene.layers import SKY_DEPTH, LayerBatch, Layers, batch, build_layers
+from vestcl.constants import SKY_DEPTH
+from vestcl.scene.layers import LayerBatch, Layers, batch, build_layers
 
 HEIGHT, WIDTH = 48, 96
 

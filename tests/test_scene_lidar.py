@@ -9,8 +9,8 @@ from data_files import real
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from vestcl.constants import SKY_DEPTH
 from vestcl.io import read_depth, read_image
-from vestcl.scene.layers import SKY_DEPTH
 from vestcl.scene.lidar import densify
 
 HEIGHT, WIDTH = 96, 240

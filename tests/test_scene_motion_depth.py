@@ -10,6 +10,7 @@ from corridor_scenes import HEIGHT, WIDTH, K, ahead, drive, off
 from data_files import pose, real
 
 from vestcl import baselines
+from vestcl.constants import SKY_DEPTH
 from vestcl.data import Street
 from vestcl.data.kitti_odometry import open_kitti_odometry
 from vestcl.data.sample import Clip, Sample
@@ -19,7 +20,6 @@ from vestcl.io.labels import SKY
 from vestcl.scene import motion_pose
 from vestcl.scene.correspondence import correspond
 from vestcl.scene.ego_motion import constant_velocity
-from vestcl.scene.layers import SKY_DEPTH
 from vestcl.scene.motion_depth import CAMERA_HEIGHT, MotionDepth, motion_depth
 from vestcl.scene.motion_mask import rigid_pixels
 from vestcl.scene.parallax import moved_pixels

@@ -43,3 +43,7 @@ CACHE_LINE: Final = 64
 HOST_POOL_FROM: Final = 1 << 18
 #: ... and so many bytes of them are kept (the outputs of a training step at 256 x 832), or what was in use at once.
 HOST_POOL_BYTES: Final = 1 << 29
+
+#: Depth of the sky, metres: so far that driving 5 m on shifts it by less than half a pixel of a 1242 pixels wide
+#: picture, so that in effect it only turns (SPEC section 3.5).
+SKY_DEPTH: Final = 10_000.0

@@ -18,6 +18,7 @@ from rich.table import Table
 from vestcl import runtime
 from vestcl.bench import _open_pixels as open_pixels
 from vestcl.bench._results import describe, write_json
+from vestcl.constants import SKY_DEPTH
 from vestcl.data import Street, intrinsics
 from vestcl.data.open import open_sequence
 from vestcl.data.raycast import SKY_DEPTH as STREET_SKY
@@ -25,7 +26,6 @@ from vestcl.io.labels import background
 from vestcl.perceptual import StLpips
 from vestcl.scene.inpaint import DEFAULT, inpaint_background
 from vestcl.scene.inpainters import METHODS
-from vestcl.scene.layers import SKY_DEPTH
 from vestcl.st_lpips import Option as StLpipsOption
 
 #: Seeds of the streets, which nothing is trained on.

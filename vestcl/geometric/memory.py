@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.constants import SKY_DEPTH
 from vestcl.geometric.perception import Perception, Surface
 from vestcl.scene.exposure import STRIDE, nearest, tone_curve
-from vestcl.scene.layers import SKY_DEPTH
 from vestcl.scene.morphology import dilated
 from vestcl.scene.motion_plane import linear
 

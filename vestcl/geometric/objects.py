@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.constants import SKY_DEPTH
 from vestcl.scene import _check
 from vestcl.scene.completion import smooth
 from vestcl.scene.correspondence import Correspondence, sample
-from vestcl.scene.layers import SKY_DEPTH
 from vestcl.scene.motion_plane import linear, rays_of
 from vestcl.scene.parallax import moved_pixels
 

@@ -9,13 +9,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from vestcl.constants import SKY_DEPTH
 from vestcl.io.labels import SKY, background
 from vestcl.models._frames import FOREGROUND_BELOW
 from vestcl.models._render import Camera, RenderedView
 from vestcl.scene import layers
 from vestcl.scene.estimators.sources import CheckedClasses, CheckedDepth
 from vestcl.scene.inpainters import Inpainter
-from vestcl.scene.layers import SKY_DEPTH, LayerBatch
+from vestcl.scene.layers import LayerBatch
 
 #: image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W] of 0 and 1 -> their layers.
 Perceive = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], LayerBatch]

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from vestcl import constants
+from vestcl.constants import SKY_DEPTH
 from vestcl.models._clouds import Cloud, Grid, last_motion
 from vestcl.models._layers import check, side_by_side
 from vestcl.models.config import LEAST_COVERAGE, RenderConfig
@@ -16,7 +17,6 @@ from vestcl.ops.displace import displace
 from vestcl.ops.splat import composite, rasterize
 from vestcl.ops.stretch import stretch
 from vestcl.scene.holes import deep_holes
-from vestcl.scene.layers import SKY_DEPTH
 
 #: Metres that inpainted points go farther back in the splatter's order, where they come last: what a frame has not seen
 #: never hides what it has. An inpainted point stands still 1 % behind the object that hides it, and a car that drives

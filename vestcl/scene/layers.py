@@ -2,20 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from vestcl.constants import SKY_DEPTH
 from vestcl.scene import _check
 from vestcl.scene.completion import complete_depth
 from vestcl.scene.inpaint import inpaint_background
 from vestcl.scene.inpainters import Inpainter
-
-#: Depth of the sky, metres: so far that driving 5 m on shifts it by less than half a pixel of a 1242 pixels wide
-#: picture, so that in effect it only turns (SPEC section 3.5).
-SKY_DEPTH: Final = 10_000.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vestcl.constants import SKY_DEPTH
 from vestcl.scene import _check, motion_fill
 from vestcl.scene.correspondence import Correspondence, correspond
-from vestcl.scene.layers import SKY_DEPTH
 from vestcl.scene.motion.outline import whole_objects
 from vestcl.scene.motion_measure import Measured, measure, moving_by_turn
 from vestcl.scene.motion_plane import fit_road, rays_of
