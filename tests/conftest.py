@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from vestcl import runtime
+from vestcl.opencl import session as runtime
 
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from data_files import write_pictures, write_text
 
-from vestcl import runtime
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
+from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH, FRAMES = 24, 40, 6
 

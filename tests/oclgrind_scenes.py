@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from vestcl import runtime
 from vestcl.data import Street, intrinsics
+from vestcl.opencl import session as runtime
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.splat import composite, rasterize

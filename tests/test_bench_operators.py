@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import torch
 
-from vestcl import runtime
 from vestcl.bench import _results, operators
 from vestcl.bench._timing import LEAST_ROUNDS
 from vestcl.bench.operators import PASSES, OperatorsBench
+from vestcl.opencl import session as runtime
 
 #: Nothing runs longer than its least number of rounds.
 TINY: dict[str, Any] = {"height": 16, "width": 24, "channels": 5, "seconds": 1e-3}

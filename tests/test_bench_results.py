@@ -13,10 +13,11 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from vestcl import doctor, runtime
+from vestcl import doctor
 from vestcl.bench import _plots, _report, _results
 from vestcl.bench._results import Measure, Results
 from vestcl.bench._timing import Spread
+from vestcl.opencl import session as runtime
 from vestcl.scoring.tables import Grid
 
 

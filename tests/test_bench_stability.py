@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from vestcl import constants, reference, runtime
+from vestcl import constants, reference
 from vestcl.bench import _results, _stability_peers, stability
 from vestcl.bench._stability_bounds import UNIT, Bounds, bounds_of, growth
 from vestcl.bench._stability_cases import FAMILIES, SIZE, Case
@@ -19,6 +19,7 @@ from vestcl.bench._stability_fragments import list_layers
 from vestcl.bench._stability_places import clear_radii, projected
 from vestcl.bench._stability_programs import OPERATORS, Operators, evaluate, relative_error
 from vestcl.bench.stability import Errors, StabilityBench
+from vestcl.opencl import session as runtime
 
 TWINS = Operators(reference.unproject, reference.rigid_flow, reference.displace, reference.splat)
 

@@ -10,8 +10,9 @@ from typing import get_args, get_type_hints
 import pytest
 from stand_ins import put_module
 
-from vestcl import __version__, cli, doctor, runtime
+from vestcl import __version__, cli, doctor
 from vestcl.io.labels import LabelKind
+from vestcl.opencl import session as runtime
 
 
 @pytest.fixture(autouse=True)

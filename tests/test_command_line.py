@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 from stand_ins import put_module
 
-from vestcl import cli, pocl_cache, runtime
+from vestcl import cli
+from vestcl.opencl import pocl_cache
+from vestcl.opencl import session as runtime
 
 ROOT = Path(__file__).resolve().parents[1]
 DEVICES = [sys.executable, "-c", "import sys; from vestcl.cli import main; sys.exit(main())", "devices"]

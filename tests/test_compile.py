@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from vestcl import runtime
+from vestcl.opencl import session as runtime
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.splat import composite, rasterize, skipped, splat

@@ -9,7 +9,8 @@ import torch
 from tolerances import assert_close, assert_like_twin
 from torch.autograd import gradcheck
 
-from vestcl import geometry, reference, runtime
+from vestcl import geometry, reference
+from vestcl.opencl import session as runtime
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from vestcl import doctor, pocl_cpu
+from vestcl import doctor
+from vestcl.opencl import pocl_cpu
 
 
 @pytest.fixture

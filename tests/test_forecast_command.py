@@ -13,12 +13,13 @@ from onnx_files import write_mix
 from st_lpips_weights import public_state
 from stand_ins import put_module
 
-from vestcl import cli, runtime
+from vestcl import cli
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
 from vestcl.forecast_files import read_forecast
 from vestcl.io.video import Video
 from vestcl.models.trunks import Trunk
+from vestcl.opencl import session as runtime
 
 
 @pytest.fixture

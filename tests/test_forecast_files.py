@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vestcl import __version__, runtime
+from vestcl import __version__
 from vestcl.data.calibration import translation
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageArray
@@ -16,6 +16,7 @@ from vestcl.forecast import Forecast, Rendered, Skipped, View
 from vestcl.forecast_files import Details, machine, read_forecast, write_forecast
 from vestcl.io.images import to_float
 from vestcl.io.video import Video
+from vestcl.opencl import session as runtime
 from vestcl.views import parse_views
 
 HEIGHT, WIDTH = 24, 40

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from vestcl import runtime
+from vestcl.opencl import session as runtime
 
 #: What forks, and says how each child ended: "passed", the error that it got, or "hangs".
 COMMON = """

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import vestcl
-from vestcl import constants, host_memory, runtime
+from vestcl import constants
+from vestcl.opencl import host_memory
+from vestcl.opencl import session as runtime
 
 MIB = 1 << 20
 

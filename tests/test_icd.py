@@ -8,7 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from vestcl import icd, runtime
+from vestcl.opencl import icd
+from vestcl.opencl import session as runtime
 
 
 @pytest.fixture

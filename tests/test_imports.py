@@ -14,7 +14,7 @@ SOURCES = [*LIBRARY, *sorted((ROOT / "train").rglob("*.py"))]
 
 
 def imports(file: Path) -> Iterator[str]:
-    """Every module that ``file`` imports, anywhere in it; ``from vestcl import runtime`` gives vestcl.runtime."""
+    """Every module that ``file`` imports, anywhere in it; ``from vestcl import runtime`` gives vestcl.opencl.session."""
     package = file.relative_to(ROOT).parts[:-1]
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -35,7 +35,7 @@ def identify(file: Path) -> str:
 
 @pytest.mark.parametrize("file", SOURCES, ids=identify)
 def test_only_the_runtime_imports_pyopencl(file: Path) -> None:
-    if identify(file) != "vestcl/runtime.py":
+    if identify(file) != "vestcl/opencl/session.py":
         assert not [module for module in imports(file) if is_in(module, "pyopencl")]
 
 
@@ -57,7 +57,7 @@ def test_the_runtime_knows_no_operator() -> None:
 
 @pytest.mark.parametrize("file", sorted((ROOT / "vestcl" / "ops").rglob("*.py")), ids=identify)
 def test_operators_stand_on_the_runtime(file: Path) -> None:
-    below = ("vestcl.constants", "vestcl.geometry", "vestcl.host_memory", "vestcl.ops", "vestcl.runtime")
+    below = ("vestcl.constants", "vestcl.geometry", "vestcl.opencl.host_memory", "vestcl.ops", "vestcl.opencl.session")
     ours = {module for module in imports(file) if is_in(module, "vestcl")}
     assert not {module for module in ours if not is_in(module, *below)}
 
@@ -65,7 +65,7 @@ def test_operators_stand_on_the_runtime(file: Path) -> None:
 def test_importing_vestcl_loads_no_driver() -> None:
     """A driver in memory means that something has enumerated the platforms."""
     code = (
-        "import vestcl, vestcl.runtime as runtime\n"
+        "import vestcl, vestcl.opencl.session as runtime\n"
         "assert runtime._all_devices.cache_info().currsize == 0\n"
         "assert 'libpocl' not in open('/proc/self/maps').read()\n"
         "assert runtime.devices()\n"

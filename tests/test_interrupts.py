@@ -16,7 +16,7 @@ import torch
 from test_robust_lock import abandon
 
 import vestcl
-from vestcl import runtime
+from vestcl.opencl import session as runtime
 from vestcl.ops import unproject
 
 #: Whose bytecodes count.

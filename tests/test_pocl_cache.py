@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from vestcl import icd, interrupt, pocl_cache, runtime
+from vestcl import interrupt
+from vestcl.opencl import icd, pocl_cache
+from vestcl.opencl import session as runtime
 
 ROOT = Path(__file__).resolve().parents[1]
 OPERATOR = """

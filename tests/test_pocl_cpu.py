@@ -4,7 +4,7 @@ import ctypes
 
 import pytest
 
-from vestcl import pocl_cpu
+from vestcl.opencl import pocl_cpu
 
 AVX2 = frozenset({"avx", "avx2", "fma", "bmi1", "bmi2", "f16c"})
 AVX512 = AVX2 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}

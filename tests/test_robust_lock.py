@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from vestcl.robust_lock import Holder, RobustLock, WithBlock
+from vestcl.opencl.robust_lock import Holder, RobustLock, WithBlock
 
 
 class Block(Holder):

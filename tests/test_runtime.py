@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl import runtime
+from vestcl.opencl import session as runtime
 
 SCALE = """
 kernel void scale(const REAL factor, global const REAL* in, global REAL* out)

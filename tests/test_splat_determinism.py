@@ -13,7 +13,8 @@ import pytest
 import torch
 from test_splat import INPUTS, all_of, assert_same_bits, detached, scene
 
-from vestcl import host_memory, runtime
+from vestcl.opencl import host_memory
+from vestcl.opencl import session as runtime
 from vestcl.ops import _splat_lists
 from vestcl.ops.splat import composite, rasterize, splat
 

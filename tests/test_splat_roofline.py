@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from vestcl import runtime
 from vestcl.bench import _roofline
 from vestcl.bench._kernels import bytes_of, flops_of
 from vestcl.bench._measure import Facts, facts_of
 from vestcl.bench._roofline import RooflineBench
 from vestcl.bench._roofs import Roofline, roofline
 from vestcl.bench._scenes import Scene, street
+from vestcl.opencl import session as runtime
 
 SIZE = (32, 48)
 CHANNELS = 4

@@ -8,7 +8,8 @@ import torch
 from test_splat import Scene, all_of, detached, pile, scene
 from tolerances import assert_like_twin
 
-from vestcl import constants, reference, runtime
+from vestcl import constants, reference
+from vestcl.opencl import session as runtime
 from vestcl.ops.splat import Skipped, composite, rasterize, skipped, splat
 
 GEOMETRY = ("points_uv", "z", "radii", "opacities", "height", "width")

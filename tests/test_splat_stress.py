@@ -14,7 +14,8 @@ from hypothesis.extra.numpy import arrays
 from test_splat import INPUTS, Scene, all_of, assert_same_bits, detached, pile, scene
 from tolerances import assert_close, assert_like_twin
 
-from vestcl import reference, runtime
+from vestcl import reference
+from vestcl.opencl import session as runtime
 from vestcl.ops.splat import splat
 
 PER_POINT = ("points_uv", "z", "radii", "opacities", "features")

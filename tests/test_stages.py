@@ -12,7 +12,6 @@ import pytest
 import torch
 from forecaster_scenes import SMALL, camera, frame, measured, stir
 
-from vestcl import trace
 from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, View
@@ -21,6 +20,7 @@ from vestcl.models.fast import accelerate
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.skipping import Count, count_skips, current_tally
 from vestcl.network import forecast_clip, forecast_frames
+from vestcl.opencl import trace
 from vestcl.stages import REST, STAGES, watching, with_rest
 
 HEIGHT, WIDTH = 32, 64

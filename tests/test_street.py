@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import vestcl
-from vestcl import runtime
 from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
 from vestcl.data.raycast import FOREGROUND
 from vestcl.data.street import CAMERA_HEIGHT
 from vestcl.io.labels import background
+from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH = 96, 320
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl import cli, runtime
+from vestcl import cli
 from vestcl.data import SKY_DEPTH, Label, Street, street_input
 from vestcl.data.raycast import FOREGROUND
 from vestcl.data.street_clip import Shot
@@ -15,6 +15,7 @@ from vestcl.data.street_input import Driven, parse
 from vestcl.data.street_road import RoadDrive
 from vestcl.data.street_sensors import DisturbedLabels, StreetScan
 from vestcl.inputs import inputs_of
+from vestcl.opencl import session as runtime
 from vestcl.prepare_clip import frame_keys
 from vestcl.prepare_command import open_input, plan
 from vestcl.prepared import find_prepared

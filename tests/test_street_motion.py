@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl import runtime
 from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
 from vestcl.data.street_drive import world_from_camera
+from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH = 96, 320
 K = intrinsics(HEIGHT, WIDTH)

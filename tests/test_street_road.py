@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl import runtime
 from vestcl.data import Label, Street, intrinsics, street_profile, street_road
 from vestcl.data.layout import BLOCK, Layout, anchored_block, block
 from vestcl.data.raycast import Material
@@ -14,6 +13,7 @@ from vestcl.data.street_bent import world_from_street
 from vestcl.data.street_course import FARTHEST_HEADING, LATERAL_JERK, SMALLEST_RADIUS, Course
 from vestcl.data.street_drive import Sway
 from vestcl.data.street_road import JERK, RoadDrive
+from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH = 64, 208
 K = intrinsics(HEIGHT, WIDTH)

@@ -5,7 +5,8 @@ import pytest
 import torch
 from tolerances import assert_like_twin
 
-from vestcl import constants, reference, runtime
+from vestcl import constants, reference
+from vestcl.opencl import session as runtime
 from vestcl.ops.stretch import stretch
 
 

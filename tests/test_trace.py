@@ -1,4 +1,4 @@
-"""vestcl.trace: the file that Perfetto opens, held against its format and against what happened."""
+"""vestcl.opencl.trace: the file that Perfetto opens, held against its format and against what happened."""
 
 import itertools
 import json
@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl import runtime, trace
+from vestcl.opencl import session as runtime
+from vestcl.opencl import trace
 from vestcl.ops.unproject import unproject
 
 Event = dict[str, Any]

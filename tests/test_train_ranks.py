@@ -18,8 +18,8 @@ from train.fit import TrainingError
 from train.ranks import LostProcessError, Ranks, lost_processes_named
 from train.report import LOG, read_log
 from train.trainer import build_model
-from vestcl import runtime
 from vestcl.models import config
+from vestcl.opencl import session as runtime
 
 #: Two processes' weights beside one's, relative to how far training has moved them. 6e-8 were measured, for the halves
 #: of a batch of two add up alike; elsewhere rounding may count for more, as Adam divides gradients by their own size.

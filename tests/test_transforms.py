@@ -11,7 +11,8 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from vestcl import reference, runtime
+from vestcl import reference
+from vestcl.opencl import session as runtime
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.splat import Raster, composite, rasterize, splat

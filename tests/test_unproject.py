@@ -8,7 +8,8 @@ import torch
 from tolerances import assert_close, assert_like_twin
 from torch.autograd import gradcheck
 
-from vestcl import reference, runtime
+from vestcl import reference
+from vestcl.opencl import session as runtime
 from vestcl.ops.unproject import unproject
 
 

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from train.checkpoint import CheckpointError
 from train.ranks import LostProcessError
-from vestcl import runtime
+from vestcl.opencl import session as runtime
 
 #: Exit status of a command that could not do what it was asked for.
 FAILED: Final = 2

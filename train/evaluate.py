@@ -33,7 +33,7 @@ from train.evaluate_sheets import write_sheets
 from train.evaluate_windows import Part, plan, read_inputs, read_part, run_part
 from train.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
-from vestcl import __version__, command_line, interrupt, options, peer, runtime
+from vestcl import __version__, command_line, interrupt, options, peer
 from vestcl.bench import _results
 from vestcl.data import street_input
 from vestcl.inputs import Inputs
@@ -42,6 +42,7 @@ from vestcl.metrics import MS_SSIM_SIDE
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.trunks import load_trunk
 from vestcl.models.voxel_flow import VoxelFlowNetwork
+from vestcl.opencl import session as runtime
 from vestcl.perceptual import Lpips, StLpips
 from vestcl.prepare_command import shard
 from vestcl.progress import Bar

@@ -29,12 +29,13 @@ from train.losses import build_perceptual
 from train.ranks import Ranks, lost_processes_named
 from train.report import Reporter
 from train.trainer import Average, NotANumberError, Trainer, build_model
-from vestcl import command_line, interrupt, runtime
+from vestcl import command_line, interrupt
 from vestcl.data.splits import KITTI_TRAINING
 from vestcl.models._checkpoint import Frames, read_trained_on
 from vestcl.models._weights import misfit
 from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster
+from vestcl.opencl import session as runtime
 from vestcl.prepared import find_prepared
 
 #: The exit status of a run that was told to stop (SIGTERM), as a shell has it.

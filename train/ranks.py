@@ -14,7 +14,7 @@ from torch import distributed
 from torch.distributed.distributed_c10d import PrefixStore
 from torch.distributed.rendezvous import rendezvous
 
-from vestcl import runtime
+from vestcl.opencl import session as runtime
 
 #: A process that does not answer for so long is given up, and torchrun starts all of them anew.
 PATIENCE: Final = timedelta(minutes=10)

@@ -14,10 +14,10 @@ from train.config import Config, Stage
 from train.data import Batch
 from train.losses import Perceptual, total_loss
 from train.ranks import Ranks
-from vestcl import runtime
 from vestcl.models.config import ModelConfig, configuration
 from vestcl.models.encoder import load_resnet34
 from vestcl.models.forecaster import Forecaster, RenderedView, Step
+from vestcl.opencl import session as runtime
 
 _PRECISIONS: Final = {"float32": None, "bfloat16": torch.bfloat16}
 

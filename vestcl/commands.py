@@ -22,7 +22,7 @@ class Devices:
 
     def run(self) -> int:
         """Print the table."""
-        from vestcl import runtime
+        from vestcl.opencl import session as runtime
 
         used = runtime.select()
         table = Table("", "index", box=box.SIMPLE, padding=0)
@@ -97,7 +97,8 @@ class Demo:
 
     def run(self) -> int:
         """Write the pictures."""
-        from vestcl import demo, runtime
+        from vestcl import demo
+        from vestcl.opencl import session as runtime
 
         with runtime.use(self.device):
             demo.run(self.out, self.height, self.width, self.seed, self.model, self.quality)

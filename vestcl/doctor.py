@@ -17,7 +17,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from vestcl import icd, pocl_cache, pocl_cpu, runtime
+from vestcl.opencl import icd, pocl_cache, pocl_cpu
+from vestcl.opencl import session as runtime
 
 #: What a child tries on its device, in this order; the first failure ends it.
 STEPS: Final = ("build", "run", "float64", "splat")

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vestcl import __version__, runtime
+from vestcl import __version__
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
 from vestcl.forecast import Forecast, Rendered, View
@@ -33,6 +33,7 @@ from vestcl.io.atomic import read_bytes, remove_leftovers, write_bytes
 from vestcl.io.exr import ExrFrame, read_exr_frame, write_exr_frame
 from vestcl.io.images import read_image, to_pixels, write_image, write_pixels
 from vestcl.io.video_writing import encoder_note, write_gif, write_mp4
+from vestcl.opencl import session as runtime
 from vestcl.sheet import Picture
 from vestcl.views import check_name, seen_by
 

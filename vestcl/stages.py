@@ -7,7 +7,7 @@ thread (a context variable), so forecasts in several threads, with one model or 
         model.forecast(...)
     watch.seconds  # {"encode": 0.31, "EMF": 0.01, ...}
 
-Each stage is also a span of `vestcl.trace` and a `torch.profiler.record_function`, by the same name.
+Each stage is also a span of `vestcl.opencl.trace` and a `torch.profiler.record_function`, by the same name.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ from typing import Any, Final, ParamSpec, TypeVar
 
 from torch.profiler import record_function
 
-from vestcl import trace
+from vestcl.opencl import trace
 
 #: Method of a `Forecaster` -> its name in tables, in the order that they run in. All other time is REST. What EMF
 #: computes from one frame is kept with the frame's features: it counts as "encode".
@@ -97,7 +97,7 @@ def watching(seen: Seen | None = None) -> Iterator[Stopwatch]:
 
 
 def timed(method: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Let a method of STAGES report its time to the thread's `watching`, to `vestcl.trace` and to torch's profiler."""
+    """Let a method of STAGES report its time to the thread's `watching`, to `vestcl.opencl.trace` and to torch's profiler."""
     name = (STAGES | _OTHER_WAYS)[method.__name__]
 
     @functools.wraps(method)

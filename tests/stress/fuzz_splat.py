@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import torch
 
-from vestcl import runtime
+from vestcl.opencl import session as runtime
 from vestcl.ops.splat import splat
 
 SCENES: Final = 20_000

@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from vestcl import runtime
 from vestcl.bench._measure import Facts, both_passes, facts_of
 from vestcl.bench._scenes import Scene
 from vestcl.bench._timing import Spread, watching_others
+from vestcl.opencl import session as runtime
 from vestcl.ops.splat import rasterize
 
 #: Profiled calls.

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from vestcl import reference, runtime
+from vestcl import reference
 from vestcl.bench._fragments import list_fragments
 from vestcl.bench._scenes import DIFFERENTIATED, Scene
 from vestcl.bench._timing import (
@@ -22,6 +22,7 @@ from vestcl.bench._timing import (
     recycling_allocator,
     watching_others,
 )
+from vestcl.opencl import session as runtime
 
 Splatter = Callable[[Scene], torch.Tensor]
 """Makes the image of a scene."""

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vestcl import constants, runtime
+from vestcl import constants
+from vestcl.opencl import session as runtime
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vestcl import metrics, trace
+from vestcl import metrics
 from vestcl.bench import _timing
 from vestcl.bench._splatter import counting
 from vestcl.bench._timing import Spread
@@ -20,6 +20,7 @@ from vestcl.bench._traffic import EMPTY, JAM, TRAFFIC, Drive, Window
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.skipping import NOTHING, Count, Skip, count_skips
 from vestcl.models.voxel_flow import VoxelFlowNetwork
+from vestcl.opencl import trace
 from vestcl.scene.layers import build_layers
 from vestcl.stages import watching, with_rest
 

@@ -17,9 +17,10 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from vestcl import __version__, doctor, runtime
+from vestcl import __version__, doctor
 from vestcl.bench._timing import Spread
 from vestcl.io import atomic
+from vestcl.opencl import session as runtime
 from vestcl.scoring.tables import Grid, finite, to_markdown, to_rich
 
 #: The selector that means every device that works.

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import tyro
 
-from vestcl import runtime
 from vestcl.bench import _plots, _report, _results
 from vestcl.bench._results import Measure, Results
 from vestcl.bench._roofs import Roofline, roofline
 from vestcl.bench._scenes import street
+from vestcl.opencl import session as runtime
 from vestcl.scoring.tables import Grid
 
 if TYPE_CHECKING:

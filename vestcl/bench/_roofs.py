@@ -14,11 +14,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl import runtime
 from vestcl.bench._kernels import bytes_of, flops_of
 from vestcl.bench._measure import Facts, both_passes, facts_of
 from vestcl.bench._scenes import Scene
 from vestcl.bench._timing import Spread, watching_others
+from vestcl.opencl import session as runtime
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from vestcl import runtime, trace
 from vestcl.bench import _timing
 from vestcl.bench._backward import BackwardWatch
 from vestcl.bench._splatter import by_twin
@@ -20,6 +19,8 @@ from vestcl.bench.network import LEARNING_RATE
 from vestcl.models._layers import joined
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.prior import MotionPrior
+from vestcl.opencl import session as runtime
+from vestcl.opencl import trace
 from vestcl.scene.layers import LayerBatch
 from vestcl.stages import watching, with_rest
 

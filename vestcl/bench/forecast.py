@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from vestcl import peer, quality, runtime
+from vestcl import peer, quality
 from vestcl.bench import _forecast_tables as tables
 from vestcl.bench import _results
 from vestcl.bench._forecast_config import HELD_OUT, ForecastBench, check
@@ -18,6 +18,7 @@ from vestcl.bench._forecast_run import Group, Networks, groups_of, kept_windows,
 from vestcl.io.atomic import write_bytes
 from vestcl.models.trunks import load_trunk
 from vestcl.models.voxel_flow import VoxelFlowNetwork
+from vestcl.opencl import session as runtime
 from vestcl.perceptual import StLpips
 
 __all__ = ["HELD_OUT", "ForecastBench", "main"]

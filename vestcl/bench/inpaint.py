@@ -15,7 +15,6 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from vestcl import runtime
 from vestcl.bench import _open_pixels as open_pixels
 from vestcl.bench._results import describe, write_json
 from vestcl.constants import SKY_DEPTH
@@ -23,6 +22,7 @@ from vestcl.data import Street, intrinsics
 from vestcl.data.open import open_sequence
 from vestcl.data.raycast import SKY_DEPTH as STREET_SKY
 from vestcl.io.labels import background
+from vestcl.opencl import session as runtime
 from vestcl.perceptual import StLpips
 from vestcl.scene.inpaint import DEFAULT, inpaint_background
 from vestcl.scene.inpainters import METHODS

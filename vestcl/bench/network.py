@@ -17,7 +17,6 @@ from rich.console import Console
 from rich.table import Table
 from torch import nn
 
-from vestcl import runtime
 from vestcl.bench import _results, _timing
 from vestcl.bench._timing import Spread
 from vestcl.data import Frame, Street, intrinsics
@@ -26,6 +25,7 @@ from vestcl.io.labels import background
 from vestcl.models import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster, Step
 from vestcl.models.prior import MotionPrior, nothing_moves
+from vestcl.opencl import session as runtime
 from vestcl.scene import layers
 from vestcl.scene.layers import LayerBatch
 

@@ -11,13 +11,15 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from vestcl import reference, runtime, trace
+from vestcl import reference
 from vestcl.bench import _plots, _report, _results, _timing
 from vestcl.bench._results import X_COPY, Measure, Results
 from vestcl.bench._scenes import AHEAD
 from vestcl.bench._timing import Spread, Task
 from vestcl.bench.splat import CHANNELS
 from vestcl.data import Street, intrinsics
+from vestcl.opencl import session as runtime
+from vestcl.opencl import trace
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.splat import splat

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from vestcl import pretrained, quality, runtime
+from vestcl import pretrained, quality
 from vestcl.bench import _pareto_plots, _pareto_report, _pareto_splatter, _results, _timing
 from vestcl.bench._pareto_front import PRICE, front, knee
 from vestcl.bench._pareto_knobs import EXACT, Knob, Setting, combinations, describe, knobs
@@ -16,6 +16,7 @@ from vestcl.bench._pareto_measure import Bench, measure, recursions
 from vestcl.bench._pareto_scenes import scene
 from vestcl.bench._results import Results
 from vestcl.models.fast import accelerate
+from vestcl.opencl import session as runtime
 from vestcl.progress import Bar
 
 #: Horizons that the two ways of going on from t + 1 are compared at.

@@ -8,7 +8,7 @@ from typing import Final, Literal
 import torch
 from rich.console import Console
 
-from vestcl import pretrained, quality, runtime, trace
+from vestcl import pretrained, quality
 from vestcl.bench import _pipeline_report, _plots, _results, _timing
 from vestcl.bench._pipeline_measure import SceneTimes, measure_scene
 from vestcl.bench._results import Results
@@ -17,6 +17,8 @@ from vestcl.bench.network import peak_gigabytes
 from vestcl.models import voxel_flow
 from vestcl.models.fast import accelerate
 from vestcl.models.forecaster import Forecaster
+from vestcl.opencl import session as runtime
+from vestcl.opencl import trace
 
 #: Of a street whose traffic is ordinary, and that no network was trained on.
 SEED: Final = 1100

@@ -10,7 +10,6 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from vestcl import runtime, trace
 from vestcl.bench import _plots, _results, _timing, _train_report
 from vestcl.bench._results import Results
 from vestcl.bench._traffic import LEAST_FRAMES, TRAFFIC, drive
@@ -19,6 +18,8 @@ from vestcl.bench.network import peak_gigabytes
 from vestcl.bench.pipeline import SEED
 from vestcl.models import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster
+from vestcl.opencl import session as runtime
+from vestcl.opencl import trace
 from vestcl.scoring.tables import Grid
 
 #: Deviation of the last layers' weights of object motion, metres: as it is made it changes nothing, and would not run

@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl import constants, runtime
+from vestcl import constants
+from vestcl.opencl import session as runtime
 
 #: z-depth of the sky in metres: far enough that a metre's move shifts it by less than a pixel, and finite.
 SKY_DEPTH: Final = 1000.0

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch.autograd import forward_ad
 
-from vestcl import runtime
+from vestcl.opencl import session as runtime
 
 Array = TypeVar("Array", torch.Tensor, np.ndarray)
 """A torch tensor or a NumPy array; an operator answers in the kind that it was asked in."""

@@ -6,7 +6,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from vestcl import constants, host_memory, runtime
+from vestcl import constants
+from vestcl.opencl import host_memory
+from vestcl.opencl import session as runtime
 from vestcl.ops._splat_lists import Array, Geometry, TileLists, chunks_of
 
 #: Channels that a GPU's work-item keeps in registers; more are composited in groups.

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from vestcl import runtime
+from vestcl.opencl import session as runtime
 from vestcl.ops._splat_lists import Geometry, TileLists, chunks_of
 
 #: Why a point is in no list, in the order in which the kernel asks and counts.

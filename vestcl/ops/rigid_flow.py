@@ -5,7 +5,8 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from vestcl import constants, geometry, runtime
+from vestcl import constants, geometry
+from vestcl.opencl import session as runtime
 from vestcl.ops._arguments import Array, as_array, check, require_ordinary, work_items
 from vestcl.ops._autograd import Gradients, differentiable_by, untraced
 

@@ -6,7 +6,8 @@ from typing import Any, Generic, NoReturn
 import numpy as np
 import torch
 
-from vestcl import constants, runtime
+from vestcl import constants
+from vestcl.opencl import session as runtime
 from vestcl.ops._arguments import Array, as_array, check, check_starts, require_no_grad, require_ordinary
 from vestcl.ops._autograd import Gradients, differentiable_once, untraced
 from vestcl.ops._splat_composite import Layer, Wanted, composite_backward, composite_forward

@@ -3,7 +3,8 @@
 import numpy as np
 import torch
 
-from vestcl import constants, runtime
+from vestcl import constants
+from vestcl.opencl import session as runtime
 from vestcl.ops._arguments import Array, as_array, check, work_items
 from vestcl.ops._autograd import untraced
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from vestcl import runtime
+from vestcl.opencl import session as runtime
 from vestcl.ops._arguments import Array, as_array, check, require_no_grad, require_ordinary, work_items
 from vestcl.ops._autograd import untraced
 

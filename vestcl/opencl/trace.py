@@ -22,8 +22,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from vestcl import __version__, runtime
+from vestcl import __version__
 from vestcl.io import atomic
+from vestcl.opencl import session as runtime
 
 #: Nanoseconds after which a device's clock is compared with the host's again: clocks drift by tens of ppm, which is
 #: some ten microseconds then.

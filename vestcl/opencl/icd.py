@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Final
 
-from vestcl import pocl_cache
+from vestcl.opencl import pocl_cache
 
 #: Where the loader looks if no environment variable names another folder.
 VENDORS: Final = "/etc/OpenCL/vendors"

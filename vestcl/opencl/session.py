@@ -30,8 +30,9 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.tools
 
-from vestcl import constants, icd, pocl_cache, pocl_cpu
-from vestcl.robust_lock import Holder, RobustLock, WithBlock
+from vestcl import constants
+from vestcl.opencl import icd, pocl_cache, pocl_cpu
+from vestcl.opencl.robust_lock import Holder, RobustLock, WithBlock
 
 Defines = Mapping[str, str | int]
 Buffer = cl.MemoryObjectHolder

@@ -7,7 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from vestcl import constants, runtime
+from vestcl import constants
+from vestcl.opencl import session as runtime
 
 Array = np.ndarray[Any, Any]
 
