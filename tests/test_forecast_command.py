@@ -17,7 +17,7 @@ from vestcl import cli
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
 from vestcl.forecast_files import read_forecast
-from vestcl.io.video import Video
+from vestcl.io.video.reading import Video
 from vestcl.models.trunks import Trunk
 from vestcl.opencl import session as runtime
 

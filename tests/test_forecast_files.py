@@ -15,7 +15,7 @@ from vestcl.data.sources import ImageArray
 from vestcl.forecast import Forecast, Rendered, Skipped, View
 from vestcl.forecast_files import Details, machine, read_forecast, write_forecast
 from vestcl.io.images import to_float
-from vestcl.io.video import Video
+from vestcl.io.video.reading import Video
 from vestcl.opencl import session as runtime
 from vestcl.views import parse_views
 

@@ -1,4 +1,4 @@
-"""vestcl.io.video and vestcl.io.video_writing."""
+"""vestcl.io.video.reading and vestcl.io.video.writing."""
 
 import os
 import pickle
@@ -20,7 +20,9 @@ from PIL import Image
 from video_files import REORDERED, cut, flat, index_of, write_video
 
 from vestcl import io
-from vestcl.io import _video_decoder, _video_packets, video_writing
+from vestcl.io.video import decoder as _video_decoder
+from vestcl.io.video import packets as _video_packets
+from vestcl.io.video import writing as video_writing
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ import matplotlib
 import numpy as np
 import pytest
 
-from vestcl import sheet
 from vestcl.forecast import Rendered
-from vestcl.sheet import Cell
+from vestcl.io import contact_sheet as sheet
+from vestcl.io.contact_sheet import Cell
 
 
 def colour(name: str, value: float) -> list[int]:

@@ -8,13 +8,13 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl import sheet
 from vestcl.data.sample import Clip, RightCamera
 from vestcl.forecast import Forecast, View
+from vestcl.io import contact_sheet as sheet
+from vestcl.io.contact_sheet import Cell, Picture
 from vestcl.models.trunks import Trunk
 from vestcl.perceptual import StLpips
 from vestcl.scoring.pictures import FLOW, ORACLE, OTHER_CAMERA, REPEAT, Timed, Truth, predictions, score
-from vestcl.sheet import Cell, Picture
 from vestcl.views import seen_by
 
 __all__ = [

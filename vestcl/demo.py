@@ -18,16 +18,17 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from vestcl import baselines, forecast_files, geometric, metrics, network, pretrained, quality, sheet
+from vestcl import baselines, forecast_files, geometric, metrics, network, pretrained, quality
 from vestcl.compare import FORECAST
 from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, View
 from vestcl.geometric import Perception
 from vestcl.geometric.forecast import METHOD as GEOMETRIC
+from vestcl.io import contact_sheet as sheet
+from vestcl.io.contact_sheet import Cell
 from vestcl.io.images import write_pixels
 from vestcl.models.forecaster import Forecaster
-from vestcl.sheet import Cell
 from vestcl.views import parse_views
 
 #: Frames up to the current one, all that the forecast looks at, and the rate, frames a second.

@@ -15,12 +15,13 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from vestcl import compare, forecast_checks, forecast_files, pretrained, quality, sheet
+from vestcl import compare, forecast_checks, forecast_files, pretrained, quality
 from vestcl.compare import Comparison
 from vestcl.data import street_input
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Skipped, View
+from vestcl.io import contact_sheet as sheet
 from vestcl.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
 from vestcl.models.trunks import load_trunk
 from vestcl.opencl import session as runtime

@@ -30,11 +30,11 @@ from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
 from vestcl.forecast import Forecast, Rendered, View
 from vestcl.io.atomic import read_bytes, remove_leftovers, write_bytes
+from vestcl.io.contact_sheet import Picture
 from vestcl.io.exr import ExrFrame, read_exr_frame, write_exr_frame
 from vestcl.io.images import read_image, to_pixels, write_image, write_pixels
-from vestcl.io.video_writing import encoder_note, write_gif, write_mp4
+from vestcl.io.video.writing import encoder_note, write_gif, write_mp4
 from vestcl.opencl import session as runtime
-from vestcl.sheet import Picture
 from vestcl.views import check_name, seen_by
 
 #: Raised when a reader of earlier files would misread newer ones.

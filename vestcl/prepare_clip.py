@@ -21,7 +21,7 @@ from vestcl.geometric.perception import Perception
 from vestcl.inputs import Inputs
 from vestcl.io.atomic import read_bytes
 from vestcl.io.images import to_float, to_pixels
-from vestcl.io.video import Video
+from vestcl.io.video.reading import Video
 from vestcl.prepared import prepare_frame
 from vestcl.prepared_files import JSON, RECIPE, Shape, frame_path, restore_frame, write_clip, write_frame
 from vestcl.scene.inpainters import Inpainter

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vestcl.io import depth as depth_io
 from vestcl.io import labels as labels_io
 from vestcl.io.images import read_image, to_float
-from vestcl.io.video import Video
+from vestcl.io.video.reading import Video
 
 
 class ImageSource(Protocol):

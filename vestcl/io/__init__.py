@@ -7,8 +7,8 @@ from vestcl.io.depth import read_cityscapes_disparity, read_depth, write_depth
 from vestcl.io.exr import ExrFrame, read_exr, read_exr_frame, write_exr, write_exr_frame
 from vestcl.io.images import image_size, read_image, read_pixels, to_float, to_pixels, write_image, write_pixels
 from vestcl.io.labels import LabelKind, background, read_ego_vehicle, read_train_ids
-from vestcl.io.video import Video
-from vestcl.io.video_writing import write_gif, write_mp4
+from vestcl.io.video.reading import Video
+from vestcl.io.video.writing import write_gif, write_mp4
 
 __all__ = [
     "ExrFrame",

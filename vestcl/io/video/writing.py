@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from vestcl.io.atomic import replacing
-from vestcl.io.video import Video
+from vestcl.io.video.reading import Video
 
 #: FFmpeg's encoders, best first, with their options. The first two write H.264, which browsers play; every build of
 #: FFmpeg has the last one. CRF 18 is visually lossless.

@@ -11,7 +11,7 @@ from av.container import InputContainer
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from vestcl.io._video_packets import Frames, explained, open_stream
+from vestcl.io.video.packets import Frames, explained, open_stream
 
 #: Decoded frames that are kept: a window of context and future frames slides without decoding twice.
 KEPT: Final = 16
