@@ -1,8 +1,8 @@
 // What the ray caster's files share. Every coordinate is relative to the camera, in world axes (x right, y down,
 // z forward, metres), so that float32 stays exact to a millimetre however far the camera has driven.
-// The structures mirror SOLID and VIEW in vestcl/data/raycast.py, field by field.
+// The structures mirror SOLID and VIEW in vestcl/data/street/raycast.py, field by field.
 #ifndef SKY_DEPTH
-#error "define SKY_DEPTH, MATERIAL_*, SHAPE_*, LABEL_* and SHADOW_CELL: see vestcl/data/raycast.py"
+#error "define SKY_DEPTH, MATERIAL_*, SHAPE_*, LABEL_* and SHADOW_CELL: see vestcl/data/street/raycast.py"
 #endif
 
 #define LANES 16  // pixels of a row that are intersected together, one 512-bit register of float

@@ -10,8 +10,8 @@ import numpy as np
 from data_files import row, write_text
 
 from vestcl.data import Street
+from vestcl.data.readers.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST
 from vestcl.data.sample import Sample
-from vestcl.data.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST
 from vestcl.io import write_pixels
 from vestcl.io.images import to_pixels
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from vestcl.bench import camera
 from vestcl.bench.camera import CameraBench
-from vestcl.data.trajectories import read_trajectory
+from vestcl.data.readers.trajectories import read_trajectory
 
 
 def poses(count: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from vestcl.bench import network
 from vestcl.bench._timing import Spread
 from vestcl.bench.network import NetworkBench, Part, Stopwatch, TimedForecaster, Timing
 from vestcl.constants import SKY_DEPTH
-from vestcl.data.raycast import SKY_DEPTH as STREET_SKY
+from vestcl.data.street.raycast import SKY_DEPTH as STREET_SKY
 from vestcl.models import configuration
 from vestcl.models.forecaster import Forecaster
 

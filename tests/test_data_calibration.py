@@ -1,4 +1,4 @@
-"""vestcl.data.calibration and vestcl.data.files."""
+"""vestcl.data.calibration and vestcl.data.readers.files."""
 
 from pathlib import Path
 
@@ -7,7 +7,8 @@ import pytest
 from data_files import picture, pose, row, write_pictures, write_text
 
 from vestcl import io
-from vestcl.data import calibration, files
+from vestcl.data import calibration
+from vestcl.data.readers import files
 
 
 def test_half_a_pixel_once() -> None:

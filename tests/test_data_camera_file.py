@@ -1,4 +1,4 @@
-"""vestcl.data.camera_file: what camera.json may not hold, and a short fuzz of it through the reader of folders."""
+"""vestcl.data.readers.camera_file: what camera.json may not hold, and a short fuzz of it through the reader of folders."""
 
 import json
 import os
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from data_files import write_pictures, write_text
 
-from vestcl.data.camera_file import read_camera
-from vestcl.data.folder import open_folder
+from vestcl.data.readers.camera_file import read_camera
+from vestcl.data.readers.folder import open_folder
 
 CAMERA: dict[str, Any] = {"fx": 70.0, "fy": 71, "cx": 4.0, "cy": 3.0}
 

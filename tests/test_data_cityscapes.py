@@ -1,4 +1,4 @@
-"""vestcl.data.cityscapes on a tiny tree in the data set's layout."""
+"""vestcl.data.readers.cityscapes on a tiny tree in the data set's layout."""
 
 import json
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 from data_files import picture, write_pictures, write_text
 
 from vestcl import io
-from vestcl.data.cityscapes import is_frame, open_cityscapes, snippets
+from vestcl.data.readers.cityscapes import is_frame, open_cityscapes, snippets
 
 NAME = "frankfurt_000000_000294"
 CAMERA = {

@@ -16,8 +16,8 @@ from data_files import picture, row, write_pictures, write_text
 from vestcl import io
 from vestcl.data import fit
 from vestcl.data.calibration import Matrix, intrinsics
-from vestcl.data.folder import open_folder
 from vestcl.data.open import open_sequence
+from vestcl.data.readers.folder import open_folder
 from vestcl.data.sample import Clip
 
 KITTI = np.array([[721.5377, 0, 610.0593], [0, 721.5377, 173.354], [0, 0, 1]])

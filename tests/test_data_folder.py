@@ -1,4 +1,4 @@
-"""vestcl.data.folder: pictures with one camera.json."""
+"""vestcl.data.readers.folder: pictures with one camera.json."""
 
 import json
 from pathlib import Path
@@ -9,8 +9,8 @@ import pytest
 from data_files import picture, pose, real, row, write_pictures, write_text
 
 from vestcl import io
-from vestcl.data.folder import open_folder, read_camera
-from vestcl.data.splits import windows
+from vestcl.data.readers.folder import open_folder, read_camera
+from vestcl.data.readers.splits import windows
 
 CAMERA: dict[str, Any] = {"fx": 70.0, "fy": 71, "cx": 4.0, "cy": 3.0}
 

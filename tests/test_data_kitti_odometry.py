@@ -1,4 +1,4 @@
-"""vestcl.data.kitti_odometry on a tiny sequence in the data set's layout, and on a real one where that is there."""
+"""vestcl.data.readers.kitti_odometry on a tiny sequence in the data set's layout, and on a real one where that is there."""
 
 import itertools
 from pathlib import Path
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from data_files import pose, real, row, write_pictures, write_text
 
-from vestcl.data.kitti_odometry import open_kitti_odometry
-from vestcl.data.splits import windows
+from vestcl.data.readers.kitti_odometry import open_kitti_odometry
+from vestcl.data.readers.splits import windows
 
 K = np.array([[70.0, 0, 14], [0, 70, 4], [0, 0, 1]])
 #: p4 of cameras 0 to 3, metres.

@@ -10,10 +10,10 @@ import pytest
 from data_files import picture, write_pictures, write_text
 
 from vestcl import io
-from vestcl.data.camera_file import read_camera
-from vestcl.data.folder import open_folder
 from vestcl.data.lens import UndistortedImage
 from vestcl.data.open import open_sequence
+from vestcl.data.readers.camera_file import read_camera
+from vestcl.data.readers.folder import open_folder
 from vestcl.data.sources import ImageFile
 
 HEIGHT, WIDTH = 60, 96

@@ -15,9 +15,9 @@ import test_data_virtual_kitti
 from data_files import picture, write_pictures, write_text
 
 from vestcl import io
-from vestcl.data import files
-from vestcl.data.folder import open_folder
 from vestcl.data.open import open_sequence
+from vestcl.data.readers import files
+from vestcl.data.readers.folder import open_folder
 
 CAMERA = {"fx": 70.0, "fy": 71, "cx": 4.0, "cy": 3.0, "depth_scale": 100, "label_ids": "trainIds", "baseline": 0.5}
 

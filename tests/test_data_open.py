@@ -1,4 +1,4 @@
-"""vestcl.data.open: the layout tells the reader; and vestcl.data.video."""
+"""vestcl.data.open: the layout tells the reader; and vestcl.data.readers.video."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -15,7 +15,7 @@ from video_files import write_video
 
 from vestcl import io
 from vestcl.data.open import open_sequence
-from vestcl.data.video import open_video
+from vestcl.data.readers.video import open_video
 
 
 def movie(tmp_path: Path) -> Path:

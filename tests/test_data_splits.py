@@ -1,9 +1,9 @@
-"""vestcl.data.splits."""
+"""vestcl.data.readers.splits."""
 
 import numpy as np
 import pytest
 
-from vestcl.data import splits
+from vestcl.data.readers import splits
 
 
 def test_published_sizes() -> None:

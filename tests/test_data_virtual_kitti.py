@@ -1,4 +1,4 @@
-"""vestcl.data.virtual_kitti on a tiny scene in the data set's layout."""
+"""vestcl.data.readers.virtual_kitti on a tiny scene in the data set's layout."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pytest
 from data_files import pose, row, write_pictures, write_text
 
 from vestcl import io
-from vestcl.data.virtual_kitti import open_virtual_kitti
+from vestcl.data.readers.virtual_kitti import open_virtual_kitti
 
 #: (height, width) of the images: resized from 375 x 1242 by 0.0267 and 0.0266.
 SIZE = (10, 33)

@@ -1,4 +1,4 @@
-"""vestcl.later_frames and what perceives a forecast frame."""
+"""vestcl.data.later_frames and what perceives a forecast frame."""
 
 from typing import Any
 
@@ -8,8 +8,8 @@ import torch
 from forecaster_scenes import SMALL, TINY
 
 from vestcl.constants import SKY_DEPTH
+from vestcl.data.later_frames import later_frames
 from vestcl.io.labels import SKY
-from vestcl.later_frames import later_frames
 from vestcl.models.forecaster import perceive_estimated, perceive_forecast
 
 CAR, ROAD = 13, 0

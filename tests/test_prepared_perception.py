@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from vestcl.data import Street
+from vestcl.data.inputs import Inputs
 from vestcl.data.sample import Clip
 from vestcl.geometric import forecast_frames
-from vestcl.inputs import Inputs
 from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.peer import forecast_frames as peer_frames
 from vestcl.prepare_clip import EightBitPerception, prepare_clip

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from vestcl.data import SKY_DEPTH, Frame, Label, objects
-from vestcl.data.raycast import SHADOW_CELL, SHADOW_REACH, Material, Scene, Shape, Solids, blank_frame, cast
+from vestcl.data import SKY_DEPTH, Frame, Label
+from vestcl.data.street import objects
+from vestcl.data.street.raycast import SHADOW_CELL, SHADOW_REACH, Material, Scene, Shape, Solids, blank_frame, cast
 from vestcl.opencl import session as runtime
 
 EYE, FOCAL, HEIGHT, WIDTH = 1.5, 40.0, 48, 64

@@ -12,9 +12,9 @@ from data_files import pose, real
 from vestcl import baselines
 from vestcl.constants import SKY_DEPTH
 from vestcl.data import Street
-from vestcl.data.kitti_odometry import open_kitti_odometry
+from vestcl.data.readers.kitti_odometry import open_kitti_odometry
+from vestcl.data.readers.video import open_video
 from vestcl.data.sample import Clip, Sample
-from vestcl.data.video import open_video
 from vestcl.geometric import perception
 from vestcl.io.labels import SKY
 from vestcl.scene import motion_pose

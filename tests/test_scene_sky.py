@@ -6,7 +6,7 @@ from data_files import real
 from numpy.typing import NDArray
 
 from vestcl.data.open import open_sequence
-from vestcl.data.street import Street, intrinsics
+from vestcl.data.street.street import Street, intrinsics
 from vestcl.geometric import Perception
 from vestcl.io import read_image
 from vestcl.io.depth import read_depth

@@ -8,8 +8,8 @@ import torch
 
 import vestcl
 from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
-from vestcl.data.raycast import FOREGROUND
-from vestcl.data.street import CAMERA_HEIGHT
+from vestcl.data.street.raycast import FOREGROUND
+from vestcl.data.street.street import CAMERA_HEIGHT
 from vestcl.io.labels import background
 from vestcl.opencl import session as runtime
 

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl.data import SKY_DEPTH, Label, Street, intrinsics, street_clip
+from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
 from vestcl.data.calibration import invert, translation
+from vestcl.data.street import clip as street_clip
 from vestcl.opencl import session as runtime
 from vestcl.scene.stereo import stereo_depth
 

@@ -8,10 +8,10 @@ import pytest
 from data_files import real
 
 from vestcl.data import Street
-from vestcl.data.files import read_poses
-from vestcl.data.layout import Layout
-from vestcl.data.street_drive import LIMITS, Drive, Recording, Sway, world_from_camera
-from vestcl.data.street_traffic import QUEUE_SPACING, Traffic
+from vestcl.data.readers.files import read_poses
+from vestcl.data.street.driving.drive import LIMITS, Drive, Recording, Sway, world_from_camera
+from vestcl.data.street.driving.traffic import QUEUE_SPACING, Traffic
+from vestcl.data.street.layout import Layout
 
 FPS = 10.0
 

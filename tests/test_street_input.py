@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from vestcl import cli
-from vestcl.data import SKY_DEPTH, Label, Street, street_input
-from vestcl.data.raycast import FOREGROUND
-from vestcl.data.street_clip import Shot
-from vestcl.data.street_input import Driven, parse
-from vestcl.data.street_road import RoadDrive
-from vestcl.data.street_sensors import DisturbedLabels, StreetScan
-from vestcl.inputs import inputs_of
+from vestcl.data import SKY_DEPTH, Label, Street
+from vestcl.data.inputs import inputs_of
+from vestcl.data.street import input as street_input
+from vestcl.data.street.clip import Shot
+from vestcl.data.street.driving.road import RoadDrive
+from vestcl.data.street.input import Driven, parse
+from vestcl.data.street.raycast import FOREGROUND
+from vestcl.data.street.sensors import DisturbedLabels, StreetScan
 from vestcl.opencl import session as runtime
 from vestcl.prepare_clip import frame_keys
 from vestcl.prepare_command import open_input, plan

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
-from vestcl.data.street_drive import world_from_camera
+from vestcl.data.street.driving.drive import world_from_camera
 from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH = 96, 320

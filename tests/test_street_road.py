@@ -6,13 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl.data import Label, Street, intrinsics, street_profile, street_road
-from vestcl.data.layout import BLOCK, Layout, anchored_block, block
-from vestcl.data.raycast import Material
-from vestcl.data.street_bent import world_from_street
-from vestcl.data.street_course import FARTHEST_HEADING, LATERAL_JERK, SMALLEST_RADIUS, Course
-from vestcl.data.street_drive import Sway
-from vestcl.data.street_road import JERK, RoadDrive
+from vestcl.data import Label, Street, intrinsics
+from vestcl.data.street.bent import world_from_street
+from vestcl.data.street.driving import profile as street_profile
+from vestcl.data.street.driving import road as street_road
+from vestcl.data.street.driving.course import FARTHEST_HEADING, LATERAL_JERK, SMALLEST_RADIUS, Course
+from vestcl.data.street.driving.drive import Sway
+from vestcl.data.street.driving.road import JERK, RoadDrive
+from vestcl.data.street.layout import BLOCK, Layout, anchored_block, block
+from vestcl.data.street.raycast import Material
 from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH = 64, 208

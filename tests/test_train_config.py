@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from train.config import Config, DataConfig, Stage, from_dict, load_config, to_dict
-from vestcl.data.splits import (
+from vestcl.data.readers.splits import (
     CITYSCAPES_TRAIN_SNIPPETS,
     KITTI_PREDICTION_TEST,
     KITTI_PREDICTION_TRAIN,

@@ -13,7 +13,7 @@ from train.config import DataConfig, DegradeConfig
 from train.data import WindowSet
 from train.degrade import Degradation
 from train.fit import window_set
-from vestcl.data import street_input
+from vestcl.data.street import input as street_input
 from vestcl.prepare_clip import prepare_clip
 from vestcl.prepared import PreparedClip, find_prepared
 

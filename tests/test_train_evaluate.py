@@ -21,7 +21,12 @@ from train.protocols import NOW, Source
 from vestcl import peer
 from vestcl.compare import FLOW, REPEAT
 from vestcl.data import Street
-from vestcl.data.splits import KITTI_PREDICTION_TEST, KITTI_PREDICTION_TRAIN, KITTI_VIEWS_TEST, KITTI_VIEWS_TRAIN
+from vestcl.data.readers.splits import (
+    KITTI_PREDICTION_TEST,
+    KITTI_PREDICTION_TRAIN,
+    KITTI_VIEWS_TEST,
+    KITTI_VIEWS_TRAIN,
+)
 from vestcl.io import read_pixels
 from vestcl.models._checkpoint import write_checkpoint
 from vestcl.models.forecaster import Forecaster

@@ -24,11 +24,11 @@ from train.evaluate_windows import forecast, inputs_of, perceptions_of, prepared
 from train.protocols import NOW, NOW_BORDER, PROTOCOLS, Name
 from vestcl import metrics
 from vestcl.data import Street
+from vestcl.data.inputs import Inputs
 from vestcl.data.sample import Clip, RightCamera
 from vestcl.data.sources import DisparityFile, ImageArray
 from vestcl.forecast import View
 from vestcl.forecast_command import Estimators
-from vestcl.inputs import Inputs
 from vestcl.models.forecaster import Forecaster
 from vestcl.scoring import GEOMETRIC, SOURCE, Truth
 from vestcl.scoring.border import blacken_border

@@ -17,7 +17,7 @@ from train.evaluate_inputs import PAIR
 from train.evaluate_options import Evaluation
 from vestcl import cli
 from vestcl.data import Street
-from vestcl.data.splits import KITTI_VIEWS_TEST
+from vestcl.data.readers.splits import KITTI_VIEWS_TEST
 from vestcl.io import write_depth
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepared import PreparedClip

@@ -18,7 +18,7 @@ from train.config import DataConfig
 from train.fit import STOPPED, TrainingError
 from train.report import LOG, Reporter, read_log
 from vestcl.data import Street
-from vestcl.data.splits import KITTI_VIEWS_TEST, KITTI_VIEWS_TRAIN
+from vestcl.data.readers.splits import KITTI_VIEWS_TEST, KITTI_VIEWS_TRAIN
 from vestcl.models import ObjectMotion, config
 from vestcl.models._checkpoint import read_trained_on, write_checkpoint
 from vestcl.models.forecaster import Forecaster

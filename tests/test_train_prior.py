@@ -21,7 +21,7 @@ from train.fit import window_set, with_intervals
 from train.ranks import Ranks
 from train.trainer import Trainer, build_model
 from vestcl import geometry
-from vestcl.inputs import Inputs
+from vestcl.data.inputs import Inputs
 from vestcl.models import config
 from vestcl.models.config import EgoMotionConfig
 from vestcl.models.forecaster import Forecaster

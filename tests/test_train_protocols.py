@@ -11,7 +11,7 @@ from kitti_trees import calibration
 from train.evaluate_windows import PART_WINDOWS, Part, plan
 from train.protocols import HELD_OUT, NOW, PROTOCOLS, Name, Where, currents
 from vestcl.bench.forecast import HELD_OUT as BENCH_HELD_OUT
-from vestcl.data.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL, windows
+from vestcl.data.readers.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL, windows
 from vestcl.io import write_pixels
 from vestcl.scoring import METRICS
 

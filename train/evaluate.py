@@ -35,8 +35,8 @@ from train.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
 from vestcl import __version__, command_line, interrupt, options, peer
 from vestcl.bench import _results
-from vestcl.data import street_input
-from vestcl.inputs import Inputs
+from vestcl.data.inputs import Inputs
+from vestcl.data.street import input as street_input
 from vestcl.io.atomic import write_bytes
 from vestcl.metrics import MS_SSIM_SIDE
 from vestcl.models.forecaster import Forecaster

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from train.protocols import Protocol
+from vestcl.data.inputs import Inputs, inputs_of, is_matched
 from vestcl.data.sample import Clip
 from vestcl.forecast_command import Estimators, load_estimators, with_estimates
 from vestcl.geometric import Perception
-from vestcl.inputs import Inputs, inputs_of, is_matched
 from vestcl.prepared_perception import PreparedPerception, PreparedSequence
 from vestcl.scene.inpainters import Inpainter, inpainter
 from vestcl.scoring import RIGHT

@@ -7,7 +7,7 @@ from typing import Literal
 import tyro
 
 from train.protocols import HELD_OUT, Name
-from vestcl.later_frames import Perceived
+from vestcl.data.later_frames import Perceived
 from vestcl.learned import Learned
 from vestcl.models.forecaster import Mode
 from vestcl.st_lpips import Option as StLpipsOption

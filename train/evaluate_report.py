@@ -9,7 +9,7 @@ from typing import Any, Final
 from train.evaluate_inputs import label_of, plain, sentences
 from train.evaluate_windows import CONSTANT_VELOCITY
 from train.protocols import PAPER_NOTE, Protocol
-from vestcl.inputs import Inputs
+from vestcl.data.inputs import Inputs
 from vestcl.scoring import (
     GEOMETRIC,
     METRICS,

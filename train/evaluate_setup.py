@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from train.evaluate_inputs import Preprocessing
 from train.protocols import Protocol
-from vestcl.later_frames import LaterFrames, Perceived, later_frames
+from vestcl.data.later_frames import LaterFrames, Perceived, later_frames
 from vestcl.learned import Learned
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.trunks import Trunk

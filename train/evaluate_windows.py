@@ -19,12 +19,12 @@ from train.evaluate_inputs import label_of, perceptions, plain
 from train.evaluate_setup import Setup
 from train.protocols import NOW, NOW_BORDER, Protocol, Source, currents
 from vestcl import network, peer
+from vestcl.data.inputs import Inputs
+from vestcl.data.later_frames import LaterFrames
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
 from vestcl.geometric import Perception, show_frame
-from vestcl.inputs import Inputs
 from vestcl.io.atomic import read_bytes, write_bytes
-from vestcl.later_frames import LaterFrames
 from vestcl.learned import Learned
 from vestcl.models.forecaster import Forecaster
 from vestcl.scoring import (

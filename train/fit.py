@@ -30,7 +30,7 @@ from train.ranks import Ranks, lost_processes_named
 from train.report import Reporter
 from train.trainer import Average, NotANumberError, Trainer, build_model
 from vestcl import command_line, interrupt
-from vestcl.data.splits import KITTI_TRAINING
+from vestcl.data.readers.splits import KITTI_TRAINING
 from vestcl.models._checkpoint import Frames, read_trained_on
 from vestcl.models._weights import misfit
 from vestcl.models.config import ModelConfig

@@ -22,15 +22,15 @@ from rich.console import Console
 
 from train.command import ERRORS, failed
 from vestcl import cli, command_line, interrupt
-from vestcl.data import street_input
 from vestcl.data.sample import Clip
+from vestcl.data.street import input as street_input
+from vestcl.data.times import is_same
 from vestcl.forecast import View
 from vestcl.forecast_planes import forecast_planes
 from vestcl.geometric import Perception, forecast_frames
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.config import FORECAST_PLANES
 from vestcl.prepare_command import open_input, plan, shard
-from vestcl.times import is_same
 
 #: Frames before t that perception looks at, t included; and by how many frames the next window's t is later.
 CONTEXT: Final = 3

@@ -22,12 +22,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from vestcl.data import street_input
-from vestcl.data.cityscapes import open_cityscapes, snippets
-from vestcl.data.kitti_raw import open_kitti_raw
 from vestcl.data.open import open_sequence
+from vestcl.data.readers.cityscapes import open_cityscapes, snippets
+from vestcl.data.readers.kitti_raw import open_kitti_raw
+from vestcl.data.readers.splits import CONTEXT, FUTURE, KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL
 from vestcl.data.sample import Clip
-from vestcl.data.splits import CONTEXT, FUTURE, KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL
+from vestcl.data.street import input as street_input
 from vestcl.prepared import PreparedClip, find_prepared
 from vestcl.prepared_perception import as_clip
 from vestcl.scoring import RIGHT, SOURCE

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from vestcl.data import street_input
+from vestcl.data.street import input as street_input
 from vestcl.options import check_pixels
 
 if TYPE_CHECKING:

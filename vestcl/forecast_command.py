@@ -17,12 +17,12 @@ from rich.text import Text
 
 from vestcl import compare, forecast_checks, forecast_files, pretrained, quality
 from vestcl.compare import Comparison
-from vestcl.data import street_input
+from vestcl.data.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
+from vestcl.data.street import input as street_input
 from vestcl.forecast import Forecast, Skipped, View
 from vestcl.io import contact_sheet as sheet
-from vestcl.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
 from vestcl.models.trunks import load_trunk
 from vestcl.opencl import session as runtime
 from vestcl.options import check_pixels

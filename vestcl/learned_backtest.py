@@ -21,6 +21,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.data.times import is_same
 from vestcl.forecast import LearnedPart, View
 from vestcl.geometric.forecast import forecast_frames as forecast_geometric
 from vestcl.geometric.paths import point_paths
@@ -45,7 +46,6 @@ from vestcl.models.forecaster import Forecaster
 from vestcl.scene.correspondence import sample
 from vestcl.scene.exposure import curve_by_flow
 from vestcl.scene.motion_plane import rays_of
-from vestcl.times import is_same
 
 #: A part must lower the error by this share: of two forecasts that are equally good, chance picks one.
 MARGIN: Final = 0.02

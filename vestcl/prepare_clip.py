@@ -16,9 +16,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.data.inputs import Inputs
 from vestcl.data.sample import Clip, Sample
 from vestcl.geometric.perception import Perception
-from vestcl.inputs import Inputs
 from vestcl.io.atomic import read_bytes
 from vestcl.io.images import to_float, to_pixels
 from vestcl.io.video.reading import Video

@@ -14,11 +14,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.table import Table
 
 from vestcl import interrupt
-from vestcl.data import street_input
+from vestcl.data.inputs import inputs_of
 from vestcl.data.sample import Clip
+from vestcl.data.street import input as street_input
 from vestcl.forecast_checks import check_file_options, is_network_file
 from vestcl.forecast_command import open_clip
-from vestcl.inputs import inputs_of
 from vestcl.prepare_clip import Outcome, Report, prepare_clip
 from vestcl.prepare_workers import Task, Told, run_tasks
 from vestcl.progress import Bar

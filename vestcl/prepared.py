@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vestcl import times
+from vestcl.data import times
+from vestcl.data.inputs import Inputs
 from vestcl.geometric.perception import Perception
-from vestcl.inputs import Inputs
 from vestcl.prepared_files import ALWAYS, DAMAGE, JSON, damaged, frame_path, read_clip, read_tensors
 from vestcl.scene.layers import Layers
 

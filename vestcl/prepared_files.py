@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from vestcl.data.inputs import Inputs, inputs_of
 from vestcl.data.sample import Clip, Sample
-from vestcl.inputs import Inputs, inputs_of
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.io.images import to_pixels
 

@@ -14,9 +14,9 @@ from vestcl.bench._forecast_config import HELD_OUT, ForecastBench
 from vestcl.bench._forecast_kept import SUFFIX, Kept, Window
 from vestcl.bench._forecast_list import Listed, read_list
 from vestcl.bench._forecast_truth import Facts
-from vestcl.data import street_input
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
+from vestcl.data.street import input as street_input
 from vestcl.forecast import View
 from vestcl.forecast_checks import check_input
 from vestcl.forecast_command import load_estimators, with_estimates

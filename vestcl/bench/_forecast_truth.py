@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vestcl import metrics
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
-from vestcl.data.street_clip import Shot, StreetImage
+from vestcl.data.street.clip import Shot, StreetImage
 from vestcl.forecast import Forecast
 from vestcl.geometric.render import Cloud, show
 from vestcl.io.labels import SKY, background

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from vestcl.data import Street
-from vestcl.data.street_drive import MAX_CHANGE, Sway
+from vestcl.data.street.driving.drive import MAX_CHANGE, Sway
 from vestcl.geometric.perception import Perception
 from vestcl.models.prior import nothing_moves
 from vestcl.network_input import NetworkInput, last_motions, network_input

@@ -12,11 +12,11 @@ from rich.progress import track
 from rich.table import Table
 
 from vestcl.bench._results import plain, settings, write_json
+from vestcl.data.later_frames import DepthOf
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.forecast_command import load_estimators
 from vestcl.geometric import Perception
-from vestcl.later_frames import DepthOf
 from vestcl.scene.depth import DepthScores, depth_scores
 from vestcl.scene.estimators import with_estimates
 

@@ -20,7 +20,7 @@ from vestcl.bench._results import describe, write_json
 from vestcl.constants import SKY_DEPTH
 from vestcl.data import Street, intrinsics
 from vestcl.data.open import open_sequence
-from vestcl.data.raycast import SKY_DEPTH as STREET_SKY
+from vestcl.data.street.raycast import SKY_DEPTH as STREET_SKY
 from vestcl.io.labels import background
 from vestcl.opencl import session as runtime
 from vestcl.perceptual import StLpips

@@ -20,7 +20,7 @@ from torch import nn
 from vestcl.bench import _results, _timing
 from vestcl.bench._timing import Spread
 from vestcl.data import Frame, Street, intrinsics
-from vestcl.data.raycast import SKY_DEPTH
+from vestcl.data.street.raycast import SKY_DEPTH
 from vestcl.io.labels import background
 from vestcl.models import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster, Step

@@ -1,6 +1,6 @@
 """Where frames come from: the procedural street, and one reader a data set, which `open.open_sequence` chooses."""
 
-from vestcl.data.raycast import SKY_DEPTH, Frame, Label
-from vestcl.data.street import Street, intrinsics
+from vestcl.data.street.raycast import SKY_DEPTH, Frame, Label
+from vestcl.data.street.street import Street, intrinsics
 
 __all__ = ["SKY_DEPTH", "Frame", "Label", "Street", "intrinsics"]

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from vestcl.data import cityscapes, folder, kitti_odometry, kitti_raw, video, virtual_kitti
-from vestcl.data.files import by_name, is_present
 from vestcl.data.lens import lens_of, undistorted_depth, undistorted_labels
+from vestcl.data.readers import cityscapes, folder, kitti_odometry, kitti_raw, video, virtual_kitti
+from vestcl.data.readers.files import by_name, is_present
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.sources import DepthFile, LabelFile
 from vestcl.io.labels import LabelKind

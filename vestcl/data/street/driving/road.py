@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import signal  # type: ignore[import-untyped]
 
-from vestcl.data.street_course import GRAVITY, Course
-from vestcl.data.street_profile import ROUGHNESS, TRACK, profile
+from vestcl.data.street.driving.course import GRAVITY, Course
+from vestcl.data.street.driving.profile import ROUGHNESS, TRACK, profile
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,9 @@ uint16 centimetres, 65535 the sky.
 from pathlib import Path
 from typing import Final
 
-from vestcl.data import calibration, files, fit
+from vestcl.data import calibration, fit
 from vestcl.data.calibration import Matrix
+from vestcl.data.readers import files
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DepthFile, ImageFile, LabelFile
 from vestcl.io.depth import VIRTUAL_KITTI_UNITS

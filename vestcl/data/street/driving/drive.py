@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.data.street_camera import check_pose
-from vestcl.data.street_road import RoadDrive
+from vestcl.data.street.camera import check_pose
+from vestcl.data.street.driving.road import RoadDrive
 
 Array = NDArray[np.float64]
 Wave = tuple[float, float]

@@ -1,7 +1,7 @@
 """The procedural street: an endless, seeded driving scene with exact colour, depth and labels at any time.
 
 World axes: x right, y down, z forward along the road, metres; the road is y = 0 and its centre line x = 0. Traffic
-keeps right, and never ends: see vestcl/data/layout.py and street_traffic.py. How the camera drives: street_drive.py.
+keeps right, and never ends: see vestcl/data/street/layout.py and street_traffic.py. How the camera drives: street_drive.py.
 With a `RoadDrive` the street bends along its course: what is said of x and z holds across it and along it.
 """
 
@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.data import calibration, layout, street_bent
-from vestcl.data.layout import BLOCK, CROSSING, Layout
-from vestcl.data.raycast import FOREGROUND, SOLID, Frame, Label, Material, Scene, Solids, blank_frame, cast
-from vestcl.data.street_camera import check_cameras, check_pose, check_samples, intrinsics
-from vestcl.data.street_course import Course
-from vestcl.data.street_drive import Drive, Recording, Sway, world_from_camera
-from vestcl.data.street_road import RoadDrive
-from vestcl.data.street_traffic import Mover, Traffic
+from vestcl.data import calibration
+from vestcl.data.street import bent as street_bent
+from vestcl.data.street import layout
+from vestcl.data.street.camera import check_cameras, check_pose, check_samples, intrinsics
+from vestcl.data.street.driving.course import Course
+from vestcl.data.street.driving.drive import Drive, Recording, Sway, world_from_camera
+from vestcl.data.street.driving.road import RoadDrive
+from vestcl.data.street.driving.traffic import Mover, Traffic
+from vestcl.data.street.layout import BLOCK, CROSSING, Layout
+from vestcl.data.street.raycast import FOREGROUND, SOLID, Frame, Label, Material, Scene, Solids, blank_frame, cast
 
 if TYPE_CHECKING:  # it needs torch, which takes seconds to import
     from vestcl.data.sample import Clip
@@ -204,7 +206,7 @@ class Street:
         foreground: bool = True,
     ) -> "Clip":
         """A drive down the street as any data set gives it, rendered when it is read; see `street_clip.clip`."""
-        from vestcl.data import street_clip  # torch comes with it
+        from vestcl.data.street import clip as street_clip
 
         size = (height, width)
         return street_clip.clip(

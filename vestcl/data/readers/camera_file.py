@@ -1,4 +1,4 @@
-"""camera.json: the camera of a folder's frames, read strictly. What it may hold is listed in vestcl/data/folder.py."""
+"""camera.json: the camera of a folder's frames, read strictly. What it may hold is listed in vestcl/data/readers/folder.py."""
 
 import difflib
 from collections.abc import Mapping
@@ -73,7 +73,7 @@ class CameraFile:
 
 
 def read_camera(path: str | Path) -> CameraFile:
-    """A camera.json, as vestcl/data/folder.py lists its keys.
+    """A camera.json, as vestcl/data/readers/folder.py lists its keys.
 
     Raises:
         ValueError: no such file, no JSON, a key that is missing or unknown, or a value out of range.

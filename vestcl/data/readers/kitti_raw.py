@@ -13,10 +13,10 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl import times
-from vestcl.data import calibration, files, fit
+from vestcl.data import calibration, fit, times
 from vestcl.data.calibration import Matrix
-from vestcl.data.files import Calibration
+from vestcl.data.readers import files
+from vestcl.data.readers.files import Calibration
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DepthFile, DepthSource, ImageFile
 from vestcl.io.atomic import read_bytes

@@ -3,11 +3,11 @@
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from vestcl.data.kitti_raw import ACCUMULATED, VelodyneScan
+from vestcl.data.readers.kitti_raw import ACCUMULATED, VelodyneScan
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.sources import DepthFile, DepthSource, DisparityFile
-from vestcl.data.street_clip import StreetDepth
-from vestcl.data.street_sensors import DisturbedLabels, StreetScan
+from vestcl.data.street.clip import StreetDepth
+from vestcl.data.street.sensors import DisturbedLabels, StreetScan
 from vestcl.scene.inpaint import DEFAULT
 
 #: Depth that is matched where a frame has no other, and a right camera.

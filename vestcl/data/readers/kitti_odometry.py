@@ -5,10 +5,11 @@ calib.txt has P0 .. P3 = K [I | p4]; a line of poses is 3x4 world_from_cam0, of 
 
 from pathlib import Path
 
-from vestcl.data import calibration, files, fit
+from vestcl.data import calibration, fit
 from vestcl.data.calibration import Matrix
-from vestcl.data.files import Calibration
-from vestcl.data.kitti_raw import RIGS, Rig
+from vestcl.data.readers import files
+from vestcl.data.readers.files import Calibration
+from vestcl.data.readers.kitti_raw import RIGS, Rig
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageFile
 from vestcl.io.images import image_size

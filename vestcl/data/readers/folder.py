@@ -20,10 +20,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from vestcl.data import calibration, files
+from vestcl.data import calibration
 from vestcl.data.calibration import Matrix
-from vestcl.data.camera_file import Camera, CameraFile, read_camera
 from vestcl.data.lens import Lens, OutsideLens, undistorted_depth, undistorted_image, undistorted_labels
+from vestcl.data.readers import files
+from vestcl.data.readers.camera_file import Camera, CameraFile, read_camera
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DepthFile, DepthSource, ImageFile, LabelFile, LabelSource
 from vestcl.io.images import image_size

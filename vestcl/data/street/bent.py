@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.data import layout
-from vestcl.data.layout import BLOCK, Layout
-from vestcl.data.raycast import COURSE, COURSE_STEP, SOLID, Solids
-from vestcl.data.street_course import Course
-from vestcl.data.street_traffic import Mover
+from vestcl.data.street import layout
+from vestcl.data.street.driving.course import Course
+from vestcl.data.street.driving.traffic import Mover
+from vestcl.data.street.layout import BLOCK, Layout
+from vestcl.data.street.raycast import COURSE, COURSE_STEP, SOLID, Solids
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.data.raycast import FOREGROUND, SKY_DEPTH
-from vestcl.data.street_camera import intrinsics
-from vestcl.data.street_clip import Shot
+from vestcl.data.street.camera import intrinsics
+from vestcl.data.street.clip import Shot
+from vestcl.data.street.raycast import FOREGROUND, SKY_DEPTH
 
 #: A scanner's elevations, degrees, its range in metres and the standard deviation of that: Velodyne's HDL-64E, as on
 #: KITTI's car (data sheet 63-9194; 64 beams). BEAMS are drawn from: its number, half and a quarter of it.

@@ -7,11 +7,11 @@ from typing import Final
 import numpy as np
 
 from vestcl.data.sample import Clip, Sample
-from vestcl.data.street import Street
-from vestcl.data.street_clip import StreetDepth
-from vestcl.data.street_drive import Sway
-from vestcl.data.street_road import RoadDrive
-from vestcl.data.street_sensors import BEAMS, DisturbedLabels, StreetScan
+from vestcl.data.street.clip import StreetDepth
+from vestcl.data.street.driving.drive import Sway
+from vestcl.data.street.driving.road import RoadDrive
+from vestcl.data.street.sensors import BEAMS, DisturbedLabels, StreetScan
+from vestcl.data.street.street import Street
 
 #: Drawn for each street by its seed.
 RANDOM: Final = "random"

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data import calibration
-from vestcl.data.raycast import Frame
 from vestcl.data.sample import Clip, RightCamera, Sample
-from vestcl.data.street import Street
-from vestcl.data.street_camera import check_samples, check_size, intrinsics
+from vestcl.data.street.camera import check_samples, check_size, intrinsics
+from vestcl.data.street.raycast import Frame
+from vestcl.data.street.street import Street
 
 #: Rendered frames that are kept, over all clips: a window of four frames, left and right.
 KEPT_FRAMES: Final = 8

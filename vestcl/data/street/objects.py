@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vestcl.data.raycast import SOLID, Label, Material, Shape, Solids
+from vestcl.data.street.raycast import SOLID, Label, Material, Shape, Solids
 
 Vector = tuple[float, float, float]
 

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from vestcl.data import calibration, files, fit
+from vestcl.data import calibration, fit
 from vestcl.data.calibration import Matrix
+from vestcl.data.readers import files
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DisparityFile, EgoVehicleFile, ImageFile, LabelFile
 from vestcl.io.atomic import read_bytes

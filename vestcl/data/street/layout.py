@@ -1,7 +1,7 @@
 """What stands and moves along the procedural street, and where.
 
 The street is built in blocks of BLOCK metres, each from the seed and its own index, so that any stretch of it can be
-built alone; moving cars and pedestrians go in endless files, see vestcl/data/street_traffic.py.
+built alone; moving cars and pedestrians go in endless files, see vestcl/data/street/driving/traffic.py.
 """
 
 import functools
@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.data import objects
-from vestcl.data.raycast import Label, Material, Shape, Solids
+from vestcl.data.street import objects
+from vestcl.data.street.raycast import Label, Material, Shape, Solids
 
 #: Length of a block of the street in metres.
 BLOCK: Final = 48.0

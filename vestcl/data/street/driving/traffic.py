@@ -14,12 +14,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.data import layout
-from vestcl.data.layout import PAVEMENT_HEIGHT, File, Layout
-from vestcl.data.objects import Vector
-from vestcl.data.raycast import Solids
-from vestcl.data.street_drive import Drive
-from vestcl.data.street_road import RoadDrive
+from vestcl.data.street import layout
+from vestcl.data.street.driving.drive import Drive
+from vestcl.data.street.driving.road import RoadDrive
+from vestcl.data.street.layout import PAVEMENT_HEIGHT, File, Layout
+from vestcl.data.street.objects import Vector
+from vestcl.data.street.raycast import Solids
 
 #: Seconds between a car of the camera's lane and the one behind it, a driver's usual headway ...
 LEAD: Final = 1.3
