@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from data_files import pose
 
-from vestcl.scene.motion_depth import CAMERA_HEIGHT
+from vestcl.scene.depth.from_motion import CAMERA_HEIGHT
 
 HEIGHT, WIDTH = 160, 288
 K = np.array([[200.0, 0, WIDTH / 2], [0, 200.0, HEIGHT / 2], [0, 0, 1]])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vestcl.data import Street, intrinsics
 from vestcl.data.sample import Clip
 from vestcl.geometric.render import Cloud
-from vestcl.scene.correspondence import Correspondence
+from vestcl.scene.flow.correspondence import Correspondence
 
 Floats = NDArray[np.float32]
 Matrix = NDArray[np.float64]

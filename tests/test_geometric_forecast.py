@@ -14,10 +14,10 @@ from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, View
 from vestcl.geometric.forecast import METHOD, _clouds, forecast_clip, forecast_frames, show_frame
 from vestcl.geometric.paths import point_paths
-from vestcl.geometric.perception import Perception
 from vestcl.geometric.render import holes, show
-from vestcl.scene.correspondence import correspond
+from vestcl.scene.flow.correspondence import correspond
 from vestcl.scene.motion.camera_forecast import forecast_camera
+from vestcl.scene.perception import Perception
 
 LEFT, RIGHT = View("left", np.eye(4)), View("right", pose(xyz=(-0.54, 0, 0)))
 

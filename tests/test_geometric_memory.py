@@ -14,8 +14,8 @@ from vestcl.forecast import Forecast, View
 from vestcl.geometric import memory
 from vestcl.geometric.forecast import _static, forecast_frames
 from vestcl.geometric.memory import Memory, remember
-from vestcl.geometric.perception import Perception, Surface
 from vestcl.geometric.render import HOLE, Shown, holes, show
+from vestcl.scene.perception import Perception, Surface
 
 NOW, DISTANCE = 6, 20.0
 

@@ -1,4 +1,4 @@
-"""vestcl.geometric.objects: foreground cut into things, and the velocity of each."""
+"""vestcl.scene.motion.objects: foreground cut into things, and the velocity of each."""
 
 import numpy as np
 import pytest
@@ -19,8 +19,8 @@ from geometric_scenes import (
 )
 
 from vestcl.constants import SKY_DEPTH
-from vestcl.geometric.objects import follow_flow, segment, velocities
-from vestcl.scene.correspondence import Correspondence
+from vestcl.scene.flow.correspondence import Correspondence
+from vestcl.scene.motion.objects import follow_flow, segment, velocities
 
 #: Of the inverse depth, 1/m.
 INVERSE_STD = 0.002

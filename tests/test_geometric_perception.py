@@ -1,4 +1,4 @@
-"""vestcl.geometric.perception: what is seen on a street, where it comes from, and what is kept how long."""
+"""vestcl.scene.perception: what is seen on a street, where it comes from, and what is kept how long."""
 
 import itertools
 import logging
@@ -19,7 +19,7 @@ from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DepthArray, DepthFile, ImageArray
 from vestcl.forecast import View
 from vestcl.geometric.forecast import forecast_frames, input_notes
-from vestcl.geometric.perception import Perception
+from vestcl.scene.perception import Perception
 
 #: A frame with another on either side.
 FRAME = 2
@@ -277,7 +277,7 @@ def test_seconds_are_exclusive(monkeypatch: pytest.MonkeyPatch) -> None:
 
     clip = drive(4).clip
     samples = (replace(s, image=slow(s, "image", 1), depth=slow(s, "depth", 10)) for s in clip)
-    monkeypatch.setattr("vestcl.geometric.perception.time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr("vestcl.scene.perception.time", SimpleNamespace(perf_counter=lambda: clock[0]))
     perception = Perception(replace(clip, samples=tuple(samples)))
     perception.seen(FRAME)
     taken = {stage: seconds for stage, seconds in perception.seconds.items() if seconds}

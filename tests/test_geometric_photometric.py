@@ -1,11 +1,11 @@
-"""vestcl.geometric.photometric: velocities that the pictures confirm."""
+"""vestcl.scene.motion.photometric: velocities that the pictures confirm."""
 
 import numpy as np
 import pytest
 from geometric_scenes import HEIGHT, WIDTH, Floats, K, Matrix, flat, move, noise, planes, points, turned
 
-from vestcl.geometric.photometric import Pair, confirmed, search
-from vestcl.scene.correspondence import sample
+from vestcl.scene.flow.correspondence import sample
+from vestcl.scene.motion.photometric import Pair, confirmed, search
 
 PREV_FROM_CUR = turned(0.01, -0.004, 0.002, (0.03, -0.01, 0.9))
 

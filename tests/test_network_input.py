@@ -16,8 +16,8 @@ from vestcl.models.ego_motion import RigidMotion
 from vestcl.models.forecaster import Forecaster
 from vestcl.network_input import as_motion, last_motions, network_input
 from vestcl.prepared import Prepared, prepare_frame
-from vestcl.scene.ego_motion import constant_velocity
 from vestcl.scene.layers import Layers
+from vestcl.scene.motion.ego_motion import constant_velocity
 
 HEIGHT, WIDTH = 8, 12
 

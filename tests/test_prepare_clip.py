@@ -15,13 +15,13 @@ from vestcl.data import calibration
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageArray
-from vestcl.geometric.perception import Perception
 from vestcl.io.images import read_pixels, to_pixels, write_pixels
 from vestcl.io.video.writing import write_mp4
 from vestcl.prepare_clip import frame_keys
 from vestcl.prepared import PreparedClip, find_prepared, prepare_frame
 from vestcl.prepared_files import frame_path
 from vestcl.scene.estimators import with_estimates
+from vestcl.scene.perception import Perception
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from vestcl.scene.flow.parallax import pixel_centres
 from vestcl.scene.motion.backtest import (
     Frame,
     backtest,
@@ -16,7 +17,6 @@ from vestcl.scene.motion.backtest import (
     residual_flow,
     untested,
 )
-from vestcl.scene.parallax import pixel_centres
 
 HEIGHT, WIDTH, FOCAL, DEPTH = 64, 160, 100.0, 10.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vestcl.scene.ego_motion import rigid
 from vestcl.scene.motion.camera_forecast import CameraForecaster, forecast_camera
+from vestcl.scene.motion.ego_motion import rigid
 from vestcl.scene.motion.gauss_markov import Bank, decaying_rate, driven_rate, joined, oscillator
 
 

@@ -1,4 +1,4 @@
-"""vestcl.scene.completion: known depth is kept, and goes up to the edges of the picture."""
+"""vestcl.scene.depth.completion: known depth is kept, and goes up to the edges of the picture."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from geometric_scenes import HEIGHT, WIDTH, Floats, flat, noise, room
 
-from vestcl.scene.completion import complete_depth
+from vestcl.scene.depth.completion import complete_depth
 
 
 def scattered(depth: Floats, share: float = 0.05) -> Floats:

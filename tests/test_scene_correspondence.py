@@ -1,4 +1,4 @@
-"""vestcl.scene.correspondence: shifts that are known, and what leaves the picture."""
+"""vestcl.scene.flow.correspondence: shifts that are known, and what leaves the picture."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from geometric_scenes import HEIGHT, WIDTH, noise
 
-from vestcl.scene.correspondence import correspond, sample
+from vestcl.scene.flow.correspondence import correspond, sample
 
 #: Dense inverse search is that good on smooth noise, px; as a median it is 0.02.
 SUBPIXEL = 0.1

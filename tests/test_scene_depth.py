@@ -12,9 +12,9 @@ from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.geometric import Perception
 from vestcl.scene.depth import combine_depth, depth_scores
+from vestcl.scene.depth.from_motion import motion_depth
 from vestcl.scene.depth.scores import DepthScores
 from vestcl.scene.estimators import OnnxDepth, with_estimates
-from vestcl.scene.motion_depth import motion_depth
 
 #: A network's errors that are alike over whole regions: 15 %, up on the left, down on the right.
 SLOPE = np.linspace(0.85, 1.15, WIDTH)[None, None]

@@ -1,4 +1,4 @@
-"""vestcl.scene.ego_motion: from exact flow, among movers, on the street, and what follows from the last motions."""
+"""vestcl.scene.motion.ego_motion: from exact flow, among movers, on the street, and what follows from the last motions."""
 
 from typing import Any
 
@@ -8,8 +8,8 @@ import pytest
 from data_files import pose
 from geometric_scenes import HEIGHT, WIDTH, K, drive, exact_flow, planes, room, turned
 
-from vestcl.scene.correspondence import Correspondence, correspond
-from vestcl.scene.ego_motion import constant_velocity, ego_motion, rigid
+from vestcl.scene.flow.correspondence import Correspondence, correspond
+from vestcl.scene.motion.ego_motion import constant_velocity, ego_motion, rigid
 
 MOTION = turned(0.02, -0.01, 0.005, (0.05, -0.02, -0.9))
 EVERYWHERE = np.ones((1, HEIGHT, WIDTH), bool)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from geometric_scenes import HEIGHT, WIDTH, Floats, flat, move, noise, points, turned
 
-from vestcl.scene.correspondence import correspond, sample
 from vestcl.scene.exposure import as_exposed, curve_by_flow, matched_for_flow, nearest, tone_curve
+from vestcl.scene.flow.correspondence import correspond, sample
+from vestcl.scene.flow.parallax import pixel_centres
 from vestcl.scene.motion.backtest import Frame, backtest
-from vestcl.scene.parallax import pixel_centres
 
 STILL = np.zeros((2, HEIGHT, WIDTH), np.float32)
 

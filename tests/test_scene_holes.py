@@ -1,9 +1,9 @@
-"""vestcl.scene.holes: what fills a hole, and that nothing else changes."""
+"""vestcl.scene.inpainting.holes: what fills a hole, and that nothing else changes."""
 
 import numpy as np
 import pytest
 
-from vestcl.scene.holes import deep_holes, fill_holes
+from vestcl.scene.inpainting.holes import deep_holes, fill_holes
 
 HEIGHT, WIDTH = 45, 64
 

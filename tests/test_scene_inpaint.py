@@ -1,4 +1,4 @@
-"""vestcl.scene.inpaint, .inpainters and .structure on a room whose background is known, and on streets."""
+"""vestcl.scene.inpainting.inpaint, .inpainters and .structure on a room whose background is known, and on streets."""
 
 from pathlib import Path
 from typing import Any
@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from vestcl.bench.inpaint import street
-from vestcl.scene.inpaint import DEFAULT, inpaint_background
-from vestcl.scene.inpainters import METHODS, Lama, inpainter
-from vestcl.scene.structure import structure_behind
+from vestcl.scene.inpainting.inpaint import DEFAULT, inpaint_background
+from vestcl.scene.inpainting.inpainters import METHODS, Lama, inpainter
+from vestcl.scene.inpainting.structure import structure_behind
 
 HEIGHT, WIDTH = 96, 208
 QUICK = [name for name in METHODS if name not in ("fsr", "biharmonic")]

@@ -1,4 +1,4 @@
-"""vestcl.scene.lidar on scans made from known depth, and on real ones."""
+"""vestcl.scene.depth.lidar on scans made from known depth, and on real ones."""
 
 import time
 
@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from vestcl.constants import SKY_DEPTH
 from vestcl.io import read_depth, read_image
-from vestcl.scene.lidar import densify
+from vestcl.scene.depth.lidar import densify
 
 HEIGHT, WIDTH = 96, 240
 

@@ -1,4 +1,4 @@
-"""vestcl.scene.motion_depth: a corridor and a street of known depth, standing still, turning, and real driving."""
+"""vestcl.scene.depth.from_motion: a corridor and a street of known depth, standing still, turning, and real driving."""
 
 from typing import Any
 
@@ -15,15 +15,15 @@ from vestcl.data import Street
 from vestcl.data.readers.kitti_odometry import open_kitti_odometry
 from vestcl.data.readers.video import open_video
 from vestcl.data.sample import Clip, Sample
-from vestcl.geometric import perception
 from vestcl.io.labels import SKY
-from vestcl.scene import motion_pose
-from vestcl.scene.correspondence import correspond
-from vestcl.scene.ego_motion import constant_velocity
-from vestcl.scene.motion_depth import CAMERA_HEIGHT, MotionDepth, motion_depth
-from vestcl.scene.motion_mask import rigid_pixels
-from vestcl.scene.parallax import moved_pixels
-from vestcl.scene.stereo import stereo_depth
+from vestcl.scene import perception
+from vestcl.scene.depth.from_motion import CAMERA_HEIGHT, MotionDepth, motion_depth
+from vestcl.scene.depth.stereo import stereo_depth
+from vestcl.scene.flow import pose as motion_pose
+from vestcl.scene.flow.correspondence import correspond
+from vestcl.scene.flow.parallax import moved_pixels
+from vestcl.scene.motion.ego_motion import constant_velocity
+from vestcl.scene.motion.mask import rigid_pixels
 
 
 @pytest.mark.parametrize("frames", [2, 4])

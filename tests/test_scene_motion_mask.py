@@ -1,4 +1,4 @@
-"""vestcl.scene.motion_mask: a box that moves by itself, and all that must not look like one."""
+"""vestcl.scene.motion.mask: a box that moves by itself, and all that must not look like one."""
 
 from typing import Any
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from geometric_scenes import HEIGHT, WIDTH, Floats, K, drive, exact_flow, flat, move, points, room, turned, with_noise
 
-from vestcl.scene.correspondence import Correspondence, correspond
-from vestcl.scene.motion_mask import motion_mask, rigid_pixels
+from vestcl.scene.flow.correspondence import Correspondence, correspond
+from vestcl.scene.motion.mask import motion_mask, rigid_pixels
 
 FORWARD = turned(0.01, -0.005, 0.002, (0.05, 0.0, -0.9))
 

@@ -1,10 +1,10 @@
-"""vestcl.scene.motion_plane: the road's plane from inverse depth."""
+"""vestcl.scene.depth.road_plane: the road's plane from inverse depth."""
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vestcl.scene.motion_plane import fit_road, rays_of
+from vestcl.scene.depth.road_plane import fit_road, rays_of
 
 HEIGHT, WIDTH = 96, 320
 K = np.array([[190.0, 0.0, 157.5], [0.0, 180.0, 45.25], [0.0, 0.0, 1.0]])

@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 
-from vestcl.scene.correspondence import Correspondence
+from vestcl.scene.flow.correspondence import Correspondence
+from vestcl.scene.flow.parallax import pixel_centres
 from vestcl.scene.motion.outline import whole_objects
-from vestcl.scene.parallax import pixel_centres
 
 HEIGHT, WIDTH = 96, 320
 CAR, STEP = np.s_[40:70, 120:180], 6

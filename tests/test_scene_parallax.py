@@ -1,4 +1,4 @@
-"""vestcl.scene.parallax: depth against exact flow, what it gains, what it refutes, and what it leaves alone."""
+"""vestcl.scene.flow.parallax: depth against exact flow, what it gains, what it refutes, and what it leaves alone."""
 
 from typing import Any
 
@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from geometric_scenes import HEIGHT, WIDTH, Floats, K, exact_flow, flat, planes, room, turned, with_noise
 
-from vestcl.scene.parallax import View, refine_depth
+from vestcl.scene.flow.parallax import View, refine_depth
 
 FORWARD = turned(0.01, -0.005, 0.002, (0.05, 0.0, -0.9))
 EVERYWHERE = np.ones((1, HEIGHT, WIDTH), bool)
 
-#: Standard deviation of dense inverse search, px, as vestcl.scene.parallax takes it.
+#: Standard deviation of dense inverse search, px, as vestcl.scene.flow.parallax takes it.
 FLOW_STD = 0.25
 
 #: Of the inverse depths here, 1/m.

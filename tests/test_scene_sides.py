@@ -1,9 +1,9 @@
-"""vestcl.scene.sides: at an image's sides a street continues towards the camera."""
+"""vestcl.scene.inpainting.sides: at an image's sides a street continues towards the camera."""
 
 import numpy as np
 
-from vestcl.scene.holes import fill_holes
-from vestcl.scene.sides import carry_on
+from vestcl.scene.inpainting.holes import fill_holes
+from vestcl.scene.inpainting.sides import carry_on
 
 HEIGHT, WIDTH = 96, 320
 CENTRE = np.array([150.0, 40.0])

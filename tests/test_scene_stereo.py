@@ -1,4 +1,4 @@
-"""vestcl.scene.stereo on pairs made from known depth, and on real ones."""
+"""vestcl.scene.depth.stereo on pairs made from known depth, and on real ones."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vestcl.baselines import backward_warp
 from vestcl.data.open import open_sequence
-from vestcl.scene.stereo import stereo_depth
+from vestcl.scene.depth.stereo import stereo_depth
 
 HEIGHT, WIDTH, FOCAL, BASELINE = 96, 256, 200.0, 0.5
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

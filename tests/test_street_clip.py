@@ -11,7 +11,7 @@ from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
 from vestcl.data.calibration import invert, translation
 from vestcl.data.street import clip as street_clip
 from vestcl.opencl import session as runtime
-from vestcl.scene.stereo import stereo_depth
+from vestcl.scene.depth.stereo import stereo_depth
 
 HEIGHT, WIDTH = 48, 160
 

@@ -17,7 +17,7 @@ from vestcl import geometry, reference
 from vestcl.models import EgoMotion, RigidMotion
 from vestcl.models.config import EgoMotionConfig
 from vestcl.network_input import last_motions, network_input
-from vestcl.scene.ego_motion import constant_velocity
+from vestcl.scene.motion.ego_motion import constant_velocity
 
 #: A camera that stands to the right of the source, turned a little, with other intrinsics and a skew.
 TGT_FROM_NEXT = turned(0.01, 0.02, -0.01, (-0.54, 0.02, 0.01))

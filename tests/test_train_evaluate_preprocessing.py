@@ -21,7 +21,7 @@ from vestcl.data.readers.splits import KITTI_VIEWS_TEST
 from vestcl.io import write_depth
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepared import PreparedClip
-from vestcl.scene.inpaint import DEFAULT
+from vestcl.scene.inpainting.inpaint import DEFAULT
 from vestcl.scoring import GEOMETRIC
 
 #: One window of one street, one step.

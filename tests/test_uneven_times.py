@@ -26,7 +26,7 @@ from vestcl.models.config import configuration
 from vestcl.network_input import last_motions, network_input
 from vestcl.prepare_clip import EightBitPerception, frame_keys, prepare_clip
 from vestcl.prepared import PreparedClip, prepare_frame
-from vestcl.scene.ego_motion import constant_velocity
+from vestcl.scene.motion.ego_motion import constant_velocity
 
 SOURCE = View("source", np.eye(4))
 

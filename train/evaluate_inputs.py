@@ -18,7 +18,7 @@ from vestcl.data.sample import Clip
 from vestcl.forecast_command import Estimators, load_estimators, with_estimates
 from vestcl.geometric import Perception
 from vestcl.prepared_perception import PreparedPerception, PreparedSequence
-from vestcl.scene.inpainters import Inpainter, inpainter
+from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 from vestcl.scoring import RIGHT
 
 Depth = Literal["clip", "motion", "pair"]

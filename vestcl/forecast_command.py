@@ -28,7 +28,7 @@ from vestcl.opencl import session as runtime
 from vestcl.options import check_pixels
 from vestcl.perceptual import StLpips
 from vestcl.progress import Bar
-from vestcl.scene.inpainters import Inpainter, inpainter
+from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 from vestcl.views import parse_views
 
 if TYPE_CHECKING:

@@ -25,7 +25,6 @@ from vestcl.data.times import is_same
 from vestcl.forecast import LearnedPart, View
 from vestcl.geometric.forecast import forecast_frames as forecast_geometric
 from vestcl.geometric.paths import point_paths
-from vestcl.geometric.perception import Perception
 from vestcl.learned import (
     CAMERA,
     OBJECTS,
@@ -43,9 +42,10 @@ from vestcl.learned import (
     retouched,
 )
 from vestcl.models.forecaster import Forecaster
-from vestcl.scene.correspondence import sample
+from vestcl.scene.depth.road_plane import rays_of
 from vestcl.scene.exposure import curve_by_flow
-from vestcl.scene.motion_plane import rays_of
+from vestcl.scene.flow.correspondence import sample
+from vestcl.scene.perception import Perception
 
 #: A part must lower the error by this share: of two forecasts that are equally good, chance picks one.
 MARGIN: Final = 0.02

@@ -13,7 +13,6 @@ from vestcl.forecast import Forecast, Rendered, Skipped, View
 from vestcl.geometric.forecast import forecast_frames as forecast_geometric
 from vestcl.geometric.forecast import input_notes
 from vestcl.geometric.paths import point_paths
-from vestcl.geometric.perception import Perception
 from vestcl.learned import REFINEMENT, CorrectedPaths, Learned, chosen_motion, given_input, refined
 from vestcl.learned_backtest import choose_parts
 from vestcl.models.config import ModelConfig
@@ -21,7 +20,8 @@ from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
 from vestcl.models.skipping import Count, Tally, count_skips
 from vestcl.network_input import NetworkInput
 from vestcl.prepared import prepare_frame
-from vestcl.scene.inpainters import Inpainter
+from vestcl.scene.inpainting.inpainters import Inpainter
+from vestcl.scene.perception import Perception
 from vestcl.stages import watching, with_rest
 
 Progress = Callable[[str, float], None]

@@ -15,9 +15,9 @@ from vestcl.models.prior import MotionPrior
 from vestcl.models.rigid_motion import RigidMotion
 from vestcl.prepared import Prepared
 from vestcl.scene import _check
-from vestcl.scene.ego_motion import constant_velocity
 from vestcl.scene.layers import LayerBatch, batch
 from vestcl.scene.motion.camera_forecast import forecast_camera
+from vestcl.scene.motion.ego_motion import constant_velocity
 
 #: So many last motions count in a path, as in the geometric forecast.
 PAST: Final = MEASURED

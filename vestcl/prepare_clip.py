@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from vestcl.data.inputs import Inputs
 from vestcl.data.sample import Clip, Sample
-from vestcl.geometric.perception import Perception
 from vestcl.io.atomic import read_bytes
 from vestcl.io.images import to_float, to_pixels
 from vestcl.io.video.reading import Video
 from vestcl.prepared import prepare_frame
 from vestcl.prepared_files import JSON, RECIPE, Shape, frame_path, restore_frame, write_clip, write_frame
-from vestcl.scene.inpainters import Inpainter
+from vestcl.scene.inpainting.inpainters import Inpainter
+from vestcl.scene.perception import Perception
 
 #: Frames before it that perception looks at: depth from motion sees three, and the frame before has to have it, too.
 LOOKS_BACK: Final = 3

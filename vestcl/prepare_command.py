@@ -22,7 +22,7 @@ from vestcl.forecast_command import open_clip
 from vestcl.prepare_clip import Outcome, Report, prepare_clip
 from vestcl.prepare_workers import Task, Told, run_tasks
 from vestcl.progress import Bar
-from vestcl.scene.inpainters import LAMA, inpainter
+from vestcl.scene.inpainting.inpainters import LAMA, inpainter
 
 if TYPE_CHECKING:
     from vestcl import cli

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from vestcl.data import times
 from vestcl.data.inputs import Inputs
-from vestcl.geometric.perception import Perception
 from vestcl.prepared_files import ALWAYS, DAMAGE, JSON, damaged, frame_path, read_clip, read_tensors
 from vestcl.scene.layers import Layers
+from vestcl.scene.perception import Perception
 
 #: Characters that make the last part of a path a pattern.
 _GLOB: Final = frozenset("*?[")

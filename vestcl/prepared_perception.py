@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip, RightCamera, Sample
-from vestcl.geometric import objects
-from vestcl.geometric.perception import Moving, Perception, Seen, Surface
 from vestcl.prepared import Prepared, PreparedClip
-from vestcl.scene.inpainters import Inpainter
+from vestcl.scene.inpainting.inpainters import Inpainter
+from vestcl.scene.motion import objects
+from vestcl.scene.perception import Moving, Perception, Seen, Surface
 
 Element = TypeVar("Element", np.float32, np.bool_)
 

@@ -14,9 +14,9 @@ from vestcl import metrics
 from vestcl.data.sample import Clip
 from vestcl.forecast import View
 from vestcl.geometric.forecast import forecast_frames
-from vestcl.geometric.perception import Perception
 from vestcl.geometric.render import HOLE
 from vestcl.perceptual import StLpips
+from vestcl.scene.perception import Perception
 from vestcl.views import parse_views
 
 #: The steps that are scored.

@@ -24,8 +24,8 @@ from vestcl.data.street.raycast import SKY_DEPTH as STREET_SKY
 from vestcl.io.labels import background
 from vestcl.opencl import session as runtime
 from vestcl.perceptual import StLpips
-from vestcl.scene.inpaint import DEFAULT, inpaint_background
-from vestcl.scene.inpainters import METHODS
+from vestcl.scene.inpainting.inpaint import DEFAULT, inpaint_background
+from vestcl.scene.inpainting.inpainters import METHODS
 from vestcl.st_lpips import Option as StLpipsOption
 
 #: Seeds of the streets, which nothing is trained on.

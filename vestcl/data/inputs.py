@@ -8,7 +8,7 @@ from vestcl.data.sample import Clip, Sample
 from vestcl.data.sources import DepthFile, DepthSource, DisparityFile
 from vestcl.data.street.clip import StreetDepth
 from vestcl.data.street.sensors import DisturbedLabels, StreetScan
-from vestcl.scene.inpaint import DEFAULT
+from vestcl.scene.inpainting.inpaint import DEFAULT
 
 #: Depth that is matched where a frame has no other, and a right camera.
 PAIR: Final = "the stereo pair at t-1 and t"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vestcl.models.config import Mode, ModelConfig
 from vestcl.models.forecaster import Perceive, perceive_estimated, perceive_forecast
-from vestcl.scene.inpainters import Inpainter
+from vestcl.scene.inpainting.inpainters import Inpainter
 
 Perceived = Literal["splatted", "estimated"]
 """Where the depth and the mask of a forecast frame come from when it is an input of the next step."""

@@ -15,11 +15,11 @@ from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Rendered, View
 from vestcl.geometric.memory import MEMORY, Memory, remember
 from vestcl.geometric.paths import Paths, forecast_cameras, point_paths
-from vestcl.geometric.perception import Perception
 from vestcl.geometric.render import Cloud, Shown, holes, rendered, show
 from vestcl.scene.exposure import as_exposed
-from vestcl.scene.holes import deep_holes, fill_holes
-from vestcl.scene.inpainters import Inpainter
+from vestcl.scene.inpainting.holes import deep_holes, fill_holes
+from vestcl.scene.inpainting.inpainters import Inpainter
+from vestcl.scene.perception import Perception
 
 #: The name of this method in tables and files.
 METHOD: Final = "geometric"

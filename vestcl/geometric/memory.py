@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.constants import SKY_DEPTH
-from vestcl.geometric.perception import Perception, Surface
+from vestcl.scene.depth.road_plane import linear
 from vestcl.scene.exposure import STRIDE, nearest, tone_curve
 from vestcl.scene.morphology import dilated
-from vestcl.scene.motion_plane import linear
+from vestcl.scene.perception import Perception, Surface
 
 #: Frames before t-1 that are remembered if nothing else is asked for; `docs/memory.md` has the figures.
 MEMORY: Final = 3

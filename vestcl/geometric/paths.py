@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.geometric.perception import Perception
+from vestcl.scene.depth.road_plane import rays_of
 from vestcl.scene.motion import backtest
 from vestcl.scene.motion.camera_forecast import forecast_camera
-from vestcl.scene.motion_plane import rays_of
+from vestcl.scene.perception import Perception
 
 #: The camera is forecast from so many last motions. On KITTI odometry 00 four have 0.66 of constant velocity's error of
 #: rotation at t+1 and 0.77 of that of translation, all that were before 0.65 and 0.72; each takes a flow and a depth.

@@ -15,7 +15,7 @@ from vestcl.models._frames import FOREGROUND_BELOW
 from vestcl.models._render import Camera, RenderedView
 from vestcl.scene import layers
 from vestcl.scene.estimators.sources import CheckedClasses, CheckedDepth
-from vestcl.scene.inpainters import Inpainter
+from vestcl.scene.inpainting.inpainters import Inpainter
 from vestcl.scene.layers import LayerBatch
 
 #: image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W] of 0 and 1 -> their layers.

@@ -16,7 +16,7 @@ from vestcl.models.skipping import Tally
 from vestcl.ops.displace import displace
 from vestcl.ops.splat import composite, rasterize
 from vestcl.ops.stretch import stretch
-from vestcl.scene.holes import deep_holes
+from vestcl.scene.inpainting.holes import deep_holes
 
 #: Metres that inpainted points go farther back in the splatter's order, where they come last: what a frame has not seen
 #: never hides what it has. An inpainted point stands still 1 % behind the object that hides it, and a car that drives

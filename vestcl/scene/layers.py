@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from vestcl.constants import SKY_DEPTH
 from vestcl.scene import _check
-from vestcl.scene.completion import complete_depth
-from vestcl.scene.inpaint import inpaint_background
-from vestcl.scene.inpainters import Inpainter
+from vestcl.scene.depth.completion import complete_depth
+from vestcl.scene.inpainting.inpaint import inpaint_background
+from vestcl.scene.inpainting.inpainters import Inpainter
 
 
 @dataclass(frozen=True, eq=False)

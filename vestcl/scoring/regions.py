@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from vestcl.data.resize import resize_labels
 from vestcl.forecast import Forecast, Rendered, View
-from vestcl.scene.motion_plane import rays_of
+from vestcl.scene.depth.road_plane import rays_of
 from vestcl.scoring.pictures import SEEN, Truth
 
 #: The regions; a pixel belongs to the first that it fits.

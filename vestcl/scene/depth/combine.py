@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import _check
-from vestcl.scene.correspondence import Correspondence, correspond
-from vestcl.scene.ego_motion import ego_motion
-from vestcl.scene.motion_depth import CAMERA_HEIGHT, observe
-from vestcl.scene.motion_measure import Measured
-from vestcl.scene.motion_plane import fit_road
+from vestcl.scene.depth.from_motion import CAMERA_HEIGHT, observe
+from vestcl.scene.depth.from_motion_measure import Measured
+from vestcl.scene.depth.road_plane import fit_road
+from vestcl.scene.flow.correspondence import Correspondence, correspond
+from vestcl.scene.motion.ego_motion import ego_motion
 
 #: Inverse depths that take part in the scale: of a standard deviation below that share of themselves, nearer than so
 #: many metres by the network.

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.scene import _check
-from vestcl.scene.completion import smooth
-from vestcl.scene.correspondence import sample
+from vestcl.scene.depth.completion import smooth
+from vestcl.scene.depth.road_plane import linear
 from vestcl.scene.exposure import as_exposed
-from vestcl.scene.motion_plane import linear
-from vestcl.scene.parallax import epipolar, moved_pixels, pixel_centres
+from vestcl.scene.flow.correspondence import sample
+from vestcl.scene.flow.parallax import epipolar, moved_pixels, pixel_centres
 
 Array = NDArray[np.float32]
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene.motion_mask import lies_flat, rigid_pixels
-from vestcl.scene.parallax import pixel_centres
+from vestcl.scene.flow.parallax import pixel_centres
+from vestcl.scene.motion.mask import lies_flat, rigid_pixels
 
 #: Mean squared gradient, (grey levels of 0 to 1 a pixel)^2, at which half of a motion is believed: that of asphalt and
 #: of a camera's noise is a tenth of it, that of a facade 20 times as much.

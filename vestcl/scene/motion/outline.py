@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.scene import _check
-from vestcl.scene.completion import smooth
-from vestcl.scene.correspondence import Correspondence, sample
+from vestcl.scene.depth.completion import smooth
 from vestcl.scene.exposure import as_exposed
+from vestcl.scene.flow.correspondence import Correspondence, sample
+from vestcl.scene.flow.parallax import pixel_centres
 from vestcl.scene.morphology import dilated, eroded
-from vestcl.scene.parallax import pixel_centres
 
 #: Asked are pixels up to that share of the image's width from a region. Flow of an object is taken from so far inside.
 _BAND, _INSIDE = 0.015, 0.004

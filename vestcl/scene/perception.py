@@ -13,26 +13,25 @@ from numpy.typing import NDArray
 
 from vestcl.data.calibration import power
 from vestcl.data.sample import Clip
-from vestcl.geometric import objects
-from vestcl.geometric.photometric import Pair, confirmed, search
 from vestcl.io.labels import SKY, background
-from vestcl.scene.correspondence import Correspondence, correspond
 from vestcl.scene.depth import CombinedDepth, combine_depth
-from vestcl.scene.ego_motion import ego_motion
+from vestcl.scene.depth.from_motion import MotionDepth, motion_depth
+from vestcl.scene.depth.lidar import densify
+from vestcl.scene.depth.stereo import stereo_depth
 from vestcl.scene.estimators.sources import EstimatedFrame
-from vestcl.scene.inpaint import DEFAULT, inpaint_background
-from vestcl.scene.inpainters import Inpainter, inpainter
+from vestcl.scene.flow.correspondence import Correspondence, correspond
+from vestcl.scene.flow.parallax import View, refine_depth
+from vestcl.scene.inpainting.inpaint import DEFAULT, inpaint_background
+from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 from vestcl.scene.layers import Layers, without_gaps
-from vestcl.scene.lidar import densify
-from vestcl.scene.motion import backtest
+from vestcl.scene.motion import backtest, objects
+from vestcl.scene.motion.ego_motion import ego_motion
+from vestcl.scene.motion.mask import motion_mask, rigid_pixels
 from vestcl.scene.motion.observable import on_the_road
 from vestcl.scene.motion.outline import whole_objects
-from vestcl.scene.motion_depth import MotionDepth, motion_depth
-from vestcl.scene.motion_mask import motion_mask, rigid_pixels
+from vestcl.scene.motion.photometric import Pair, confirmed, search
 from vestcl.scene.own_car import own_car
-from vestcl.scene.parallax import View, refine_depth
 from vestcl.scene.sky import sky_mask
-from vestcl.scene.stereo import stereo_depth
 
 #: Standard deviation of a stereo pair's disparity, px, and the nearest depth that is searched for, m.
 _DISPARITY_STD, _NEAREST = 0.35, 2.0
@@ -109,7 +108,7 @@ class Perception:
     Args:
         clip: at its own size.
         progress: called with the stage that begins.
-        inpaint: how the background behind the foreground is filled, as `vestcl.scene.inpaint.inpaint_background` takes
+        inpaint: how the background behind the foreground is filled, as `vestcl.scene.inpainting.inpaint.inpaint_background` takes
             it; None is its default.
 
     Raises:

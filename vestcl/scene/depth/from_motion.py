@@ -7,13 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.constants import SKY_DEPTH
-from vestcl.scene import _check, motion_fill
-from vestcl.scene.correspondence import Correspondence, correspond
+from vestcl.scene import _check
+from vestcl.scene.depth import from_motion_fill as motion_fill
+from vestcl.scene.depth.from_motion_measure import Measured, measure, moving_by_turn
+from vestcl.scene.depth.road_plane import fit_road, rays_of
+from vestcl.scene.flow.correspondence import Correspondence, correspond
+from vestcl.scene.flow.parallax import epipolar
+from vestcl.scene.flow.pose import relative_pose
 from vestcl.scene.motion.outline import whole_objects
-from vestcl.scene.motion_measure import Measured, measure, moving_by_turn
-from vestcl.scene.motion_plane import fit_road, rays_of
-from vestcl.scene.motion_pose import relative_pose
-from vestcl.scene.parallax import epipolar
 from vestcl.scene.sky import sky_mask
 
 #: Height of the camera above the road, metres, where none is told: behind the windscreen of a car. KITTI's is 1.65.

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene.correspondence import Correspondence
-from vestcl.scene.ego_motion import rigid
-from vestcl.scene.parallax import moved_pixels, pixel_centres
+from vestcl.scene.flow.correspondence import Correspondence
+from vestcl.scene.flow.parallax import moved_pixels, pixel_centres
+from vestcl.scene.motion.ego_motion import rigid
 
 #: Every which pixel, both ways, takes part: neighbours of a dense flow say the same.
 _STRIDE: Final = 6

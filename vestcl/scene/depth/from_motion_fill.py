@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene import _check, completion
+from vestcl.scene import _check
+from vestcl.scene.depth import completion
 from vestcl.scene.morphology import dilated
-from vestcl.scene.motion_mask import without_specks
+from vestcl.scene.motion.mask import without_specks
 
 #: Off the road: by more standard deviations than that, and by more than that share of the road's inverse depth.
 _OFF, _OFF_SHARE = 3.0, 0.25

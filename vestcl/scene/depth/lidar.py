@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree  # type: ignore[import-untyped]
 
 from vestcl.constants import SKY_DEPTH
 from vestcl.scene import _check
-from vestcl.scene.completion import smooth
+from vestcl.scene.depth.completion import smooth
 from vestcl.scene.regions import mean_by_region, superpixels
 
 #: A return shines through a nearer surface if more than half of its nearest returns, so many, have inverse depths above

@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene.motion_plane import fit_road, rays_of
+from vestcl.scene.depth.road_plane import fit_road, rays_of
 
 #: The focal length that the search for a level plane takes, as a share of the width: whether the plane is found
 #: depends little on it, and its fit not at all.

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import _check
-from vestcl.scene.correspondence import Correspondence, check_size
-from vestcl.scene.motion_plane import pixels_through
+from vestcl.scene.depth.road_plane import pixels_through
+from vestcl.scene.flow.correspondence import Correspondence, check_size
 
 #: Standard deviation of dense inverse search where its flow returns, px (0.2 and 0.35 serve equally well).
 _FLOW_STD: Final = 0.25

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vestcl.data.calibration import power
 from vestcl.scene import _check
-from vestcl.scene.correspondence import Correspondence, check_size
+from vestcl.scene.flow.correspondence import Correspondence, check_size
 
 #: Every which pixel, both ways, takes part: neighbours of a dense flow say the same.
 _STRIDE: Final = 4

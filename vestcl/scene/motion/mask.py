@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import _check
-from vestcl.scene.correspondence import Correspondence, check_size
-from vestcl.scene.parallax import epipolar, moved_pixels, pixel_centres
+from vestcl.scene.flow.correspondence import Correspondence, check_size
+from vestcl.scene.flow.parallax import epipolar, moved_pixels, pixel_centres
 
 #: Forward-backward error beyond which flow is not believed, px.
 _FLOW_ERROR: Final = 1.0

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.geometric.objects import pixels_by_thing, some_points
 from vestcl.scene import _check
-from vestcl.scene.completion import smooth
-from vestcl.scene.correspondence import sample
+from vestcl.scene.depth.completion import smooth
+from vestcl.scene.depth.road_plane import linear, rays_of
 from vestcl.scene.exposure import STRIDE, nearest, tone_curve
-from vestcl.scene.motion_plane import linear, rays_of
+from vestcl.scene.flow.correspondence import sample
+from vestcl.scene.motion.objects import pixels_by_thing, some_points
 from vestcl.scene.regions import mean_by_region, superpixels
 
 Array = NDArray[np.float64]
@@ -114,7 +114,7 @@ def search(things: NDArray[np.int32], by_flow: Array, depth: NDArray[np.float32]
 
     Args:
         things: [H, W], 0 = background.
-        by_flow: [n + 1, 3] m a frame, `vestcl.geometric.objects.velocities`.
+        by_flow: [n + 1, 3] m a frame, `vestcl.scene.motion.objects.velocities`.
         depth: [1, H, W] m at t; 0 = invalid.
         pair: both frames.
 
@@ -208,7 +208,7 @@ def confirmed(
     which keep to one depth, too.
 
     Args:
-        corrected: c [3, H, W] m a frame, from `vestcl.geometric.objects.follow_flow`.
+        corrected: c [3, H, W] m a frame, from `vestcl.scene.motion.objects.follow_flow`.
         velocity: v [3, H, W] m a frame.
         depth: [1, H, W] m at t, above 0.
         pair: both frames, which may be exposed differently.

@@ -13,7 +13,7 @@ from skimage.restoration import inpaint_biharmonic
 from torch.nn import functional
 
 from vestcl.scene import _check
-from vestcl.scene.holes import push_pull
+from vestcl.scene.inpainting.holes import push_pull
 
 #: Radius of the surroundings that OpenCV's methods look at, px.
 _RADIUS: Final = 5

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene.correspondence import sample
+from vestcl.scene.flow.correspondence import sample
 
 #: Where neighbouring lines enter the hole is smoothed over so many of them, both sides, in an image 832 wide, lest
 #: the ragged edge of a hole is drawn out.

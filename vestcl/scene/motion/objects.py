@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from vestcl.constants import SKY_DEPTH
 from vestcl.scene import _check
-from vestcl.scene.completion import smooth
-from vestcl.scene.correspondence import Correspondence, sample
-from vestcl.scene.motion_plane import linear, rays_of
-from vestcl.scene.parallax import moved_pixels
+from vestcl.scene.depth.completion import smooth
+from vestcl.scene.depth.road_plane import linear, rays_of
+from vestcl.scene.flow.correspondence import Correspondence, sample
+from vestcl.scene.flow.parallax import moved_pixels
 
 #: Neighbours whose depths differ by a larger factor belong to different things.
 _JUMP: Final = 0.08

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene.correspondence import Correspondence
-from vestcl.scene.motion_pose import Pose
-from vestcl.scene.parallax import epipolar, moved_pixels
+from vestcl.scene.flow.correspondence import Correspondence
+from vestcl.scene.flow.parallax import epipolar, moved_pixels
+from vestcl.scene.flow.pose import Pose
 
 #: Forward-backward error, and distance to the epipolar line, beyond which flow says nothing of depth, px.
 _FLOW_ERROR, _OFF_LINE = 1.0, 1.0

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from vestcl import constants
 from vestcl.scene import _check
-from vestcl.scene.inpainters import Inpainter, inpainter
-from vestcl.scene.structure import structure_behind
+from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
+from vestcl.scene.inpainting.structure import structure_behind
 
 #: How colour is filled if nothing else is asked for. `vestcl bench inpaint` over 20 streets: regions 15.7 dB in 0.04 s,
 #: push-pull 15.5 dB, fsr 15.2 dB in 0.6 s, telea 14.2 dB, ns 13.6 dB, biharmonic 11.9 dB; and regions alone keeps the

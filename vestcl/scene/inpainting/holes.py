@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene.sides import carry_on
+from vestcl.scene.inpainting.sides import carry_on
 
 #: Surroundings count by 1 / (1/z + that)^2, 1/m: what was hidden is likelier to go on behind a hole than what hid it.
 _FAR: Final = 0.01
