@@ -7,7 +7,6 @@ import torch
 from torch import nn
 
 from vestcl.models import EgoMotion, ModelConfig, ObjectMotion, RigidMotion
-from vestcl.models._render import Side
 from vestcl.models.config import (
     FIXED_DEPTH,
     EgoMotionConfig,
@@ -18,7 +17,8 @@ from vestcl.models.config import (
     RoutingConfig,
 )  # fmt: skip
 from vestcl.models.forecaster import Forecaster, Step
-from vestcl.models.prior import MotionPrior
+from vestcl.models.steps.prior import MotionPrior
+from vestcl.models.steps.render import Side
 from vestcl.scene.layers import LayerBatch
 
 OBJECTS = ObjectMotionConfig("dmvfn", scales=(2, 1), widths=(8, 8), detail=4)

@@ -25,8 +25,8 @@ from vestcl.data.calibration import invert
 from vestcl.data.sample import Clip, Sample
 from vestcl.forecast import Forecast, Rendered, View
 from vestcl.io.labels import SKY
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.models.trunks import Trunk
-from vestcl.models.voxel_flow import VoxelFlowNetwork
 
 SIZE = 64, 208
 TINY: dict[str, Any] = {

@@ -13,7 +13,7 @@ from forecaster_scenes import ABLATIONS, SMALL, TINY, camera, pair_of, stir, tur
 from vestcl.bench import _results, _timing
 from vestcl.bench._network_speed import PLAIN, Group, Section, network_speed
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.skipping import Skip
+from vestcl.models.inference.skipping import Skip
 
 #: "equal" in tables, and what bfloat16 keeps of small networks with random weights.
 EXACT, NEAR = 90, 20

@@ -10,7 +10,6 @@ import pytest
 import torch
 from forecaster_scenes import SMALL, stir
 
-from vestcl import quality
 from vestcl.bench import _pareto_plots, _pareto_splatter, pareto
 from vestcl.bench._fragments import list_fragments
 from vestcl.bench._pareto_front import PRICE, Point, front, knee
@@ -20,9 +19,10 @@ from vestcl.bench._results import load
 from vestcl.bench._scenes import street
 from vestcl.bench._timing import Spread
 from vestcl.bench.pareto import ParetoBench
-from vestcl.models.effort import Effort
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.skipping import NOTHING, Skip
+from vestcl.models.inference import quality
+from vestcl.models.inference.effort import Effort
+from vestcl.models.inference.skipping import NOTHING, Skip
 
 #: Of vest-s, all that can be turned.
 TURNED = dataclasses.replace(

@@ -16,12 +16,12 @@ from vestcl.bench._pipeline_measure import ALL, NONE, PEER, SWITCHES, TWICE, Pic
 from vestcl.bench._timing import Spread
 from vestcl.bench._traffic import EMPTY, EVERYTHING, JAM, STREETS, TRAFFIC, drive
 from vestcl.bench.pipeline import PipelineBench, load, main
-from vestcl.models import _render
 from vestcl.models.config import EncoderConfig
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.skipping import NOTHING, Skip
+from vestcl.models.inference.skipping import NOTHING, Skip
+from vestcl.models.inference.stage_times import REST, STAGES
+from vestcl.models.steps import render as _render
 from vestcl.ops.splat import rasterize
-from vestcl.stages import REST, STAGES
 
 HEIGHT, WIDTH = 32, 96
 

@@ -26,10 +26,10 @@ from vestcl.bench._train_measure import (
     stacked,
 )
 from vestcl.bench.train_step import TrainStepBench, main
-from vestcl.models import _render
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.inference.stage_times import REST, STAGES
+from vestcl.models.steps import render as _render
 from vestcl.ops.splat import composite, rasterize
-from vestcl.stages import REST, STAGES
 
 HEIGHT, WIDTH = 32, 64
 

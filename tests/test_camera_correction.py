@@ -9,7 +9,9 @@ from torch import nn
 
 from vestcl import geometry
 from vestcl.models import EgoMotion, RigidMotion, configuration
-from vestcl.models.camera_correction import (
+from vestcl.models.config import EgoMotionConfig
+from vestcl.models.forecaster import Forecaster
+from vestcl.models.networks.camera_correction import (
     ACCELERATION,
     MEASURED,
     RATES,
@@ -18,8 +20,6 @@ from vestcl.models.camera_correction import (
     CameraPrior,
     rates_of,
 )
-from vestcl.models.config import EgoMotionConfig
-from vestcl.models.forecaster import Forecaster
 
 PATH = 3
 SECONDS = (1 / 30, 0.1, 1 / 8)

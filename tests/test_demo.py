@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vestcl import demo, pretrained
+from vestcl import demo
 from vestcl.data import Street
 from vestcl.models import configuration
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.inference import pretrained
 from vestcl.views import parse_view
 
 

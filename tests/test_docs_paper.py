@@ -93,11 +93,15 @@ def test_it_has_all_parts_and_is_linked() -> None:
 @pytest.mark.parametrize(
     ("label", "target", "fault"),
     [
-        ("encoder.py:Encoder", "../vestcl/models/encoder.py", None),
-        ("encoder.py:Encoder.forward", "../vestcl/models/encoder.py", None),
-        ("encoder.py:Encoder.backward", "../vestcl/models/encoder.py", "encoder.py:Encoder.backward: no such name"),
-        ("encoder.py:STRIDE", "../vestcl/models/encoder.py", None),
-        ("encoder.py:Encoder", "../vestcl/models/refine.py", "encoder.py:Encoder: the link is to refine.py"),
+        ("encoder.py:Encoder", "../vestcl/models/networks/encoder.py", None),
+        ("encoder.py:Encoder.forward", "../vestcl/models/networks/encoder.py", None),
+        (
+            "encoder.py:Encoder.backward",
+            "../vestcl/models/networks/encoder.py",
+            "encoder.py:Encoder.backward: no such name",
+        ),
+        ("encoder.py:STRIDE", "../vestcl/models/networks/encoder.py", None),
+        ("encoder.py:Encoder", "../vestcl/models/networks/refine.py", "encoder.py:Encoder: the link is to refine.py"),
         ("decoder.py:Decoder", "../vestcl/models/decoder.py", "../vestcl/models/decoder.py: no such file"),
         ("unproject.cl:unproject_backward", "../kernels/unproject.cl", None),
         ("unproject.cl:row_start", "../kernels/unproject.cl", "unproject.cl:row_start: no such name"),

@@ -8,8 +8,8 @@ import torch
 from forecaster_scenes import PAINTING, SMALL, camera, measured, pair_of, stir
 
 from vestcl.models import ObjectMotion
-from vestcl.models.effort import Effort, enlarged, fraction, reduced
 from vestcl.models.forecaster import Forecaster, Step
+from vestcl.models.inference.effort import Effort, enlarged, fraction, reduced
 from vestcl.scene.layers import LayerBatch
 
 HEIGHT, WIDTH = 48, 64

@@ -1,4 +1,4 @@
-"""vestcl.models.ego_motion: its size, where it starts, the path, positions and masks."""
+"""vestcl.models.networks.ego_motion: its size, where it starts, the path, positions and masks."""
 
 import math
 from typing import Any
@@ -10,7 +10,7 @@ from tolerances import assert_close
 from vestcl import geometry
 from vestcl.models import EgoMotion, RigidMotion, configuration
 from vestcl.models.config import EgoMotionConfig
-from vestcl.models.ego_motion import CameraMotion, background_tokens, sinusoidal_positions
+from vestcl.models.networks.ego_motion import CameraMotion, background_tokens, sinusoidal_positions
 
 SMALL = EgoMotionConfig(widths=(8, 8, 12, 16), heads=2, mlp_ratio=2)
 

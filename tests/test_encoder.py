@@ -1,4 +1,4 @@
-"""vestcl.models.encoder: its size, its shapes, and public weights that load into it."""
+"""vestcl.models.networks.encoder: its size, its shapes, and public weights that load into it."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from vestcl.models import Encoder, configuration, load_resnet34, upsample_features
 from vestcl.models.config import EncoderConfig
-from vestcl.models.encoder import normalise
+from vestcl.models.networks.encoder import normalise
 
 SMALL = EncoderConfig(widths=(8, 12, 16), blocks=(2, 1, 1), decoder=(12, 8), features=4)
 

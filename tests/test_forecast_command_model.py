@@ -11,11 +11,12 @@ from forecast_clips import Repeater, write_clip
 from forecaster_scenes import SMALL, TINY
 from stand_ins import put_module
 
-from vestcl import cli, pretrained
+from vestcl import cli
 from vestcl.compare import ORACLE
 from vestcl.data.sample import Clip
 from vestcl.forecast_files import read_forecast
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.inference import pretrained
 
 
 @pytest.fixture

@@ -9,11 +9,12 @@ from safetensors.torch import save_file
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models import _render, configuration
-from vestcl.models._clouds import Cloud
-from vestcl.models._render import splat_cloud
+from vestcl.models import configuration
 from vestcl.models.config import LEAST_COVERAGE, RenderConfig
 from vestcl.models.forecaster import Camera, Forecaster
+from vestcl.models.steps import render as _render
+from vestcl.models.steps.clouds import Cloud
+from vestcl.models.steps.render import splat_cloud
 from vestcl.scene.layers import LayerBatch
 
 # ---------------------------------------------------------------- shapes

@@ -26,10 +26,10 @@ from forecaster_scenes import (
 from safetensors.torch import save_file
 
 from vestcl.models import EgoMotion, ModelConfig, ObjectMotion
-from vestcl.models._checkpoint import KEY
-from vestcl.models._clouds import in_plane
+from vestcl.models.checkpoint import KEY
 from vestcl.models.config import FIXED_DEPTH
 from vestcl.models.forecaster import Forecaster, Step
+from vestcl.models.steps.clouds import in_plane
 from vestcl.scene.layers import LayerBatch
 
 HEIGHT, WIDTH = 32, 48

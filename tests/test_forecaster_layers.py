@@ -5,8 +5,8 @@ import torch
 from forecaster_scenes import TINY, camera, pair_of, stir
 
 from vestcl.models import EgoMotion, ObjectMotion, upsample_features
-from vestcl.models._frames import grid_depth, grid_mean
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.steps.frames import grid_depth, grid_mean
 from vestcl.scene.layers import LayerBatch
 
 HEIGHT, WIDTH = 32, 48

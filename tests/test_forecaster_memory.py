@@ -13,11 +13,11 @@ import torch
 from forecaster_scenes import SMALL, TINY, camera, frame, measured, stir
 from torch import nn
 
-from vestcl.models._frames import EncodedFrame
-from vestcl.models._memory import Memory
-from vestcl.models.fast import accelerate
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.skipping import NOTHING, count_skips
+from vestcl.models.inference.fast import accelerate
+from vestcl.models.inference.skipping import NOTHING, count_skips
+from vestcl.models.steps.frames import EncodedFrame
+from vestcl.models.steps.memory import Memory
 from vestcl.scene.layers import LayerBatch
 
 HEIGHT, WIDTH = 32, 64

@@ -7,10 +7,10 @@ from forecaster_scenes import ABLATIONS, FOCAL, SHARP, TINY, camera, drive, fram
 
 from vestcl.constants import SKY_DEPTH
 from vestcl.models import EgoMotion, ObjectMotion
-from vestcl.models._frames import grid_depth, grid_mean
-from vestcl.models._render import Side, compose_view
 from vestcl.models.config import FIXED_DEPTH, LEAST_COVERAGE, LOG_DEPTH_FAR
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.steps.frames import grid_depth, grid_mean
+from vestcl.models.steps.render import Side, compose_view
 
 # ---------------------------------------------------------------- by hand
 

@@ -19,8 +19,8 @@ from forecaster_scenes import (
 )
 
 from vestcl import geometry
-from vestcl.models.ego_motion import RigidMotion
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.networks.ego_motion import RigidMotion
 
 #: What is said of three intervals, turn and shift: a metre to the side, one more metre, and one back again.
 SIDEWAYS = [0.0, 0, 0, 10, 0, 0], [0.0, 0, 0, 20, 0, 0], [0.0, 0, 0, -10, 0, 0]

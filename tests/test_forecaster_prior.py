@@ -23,7 +23,7 @@ from forecaster_scenes import (
 from vestcl import geometry
 from vestcl.models import RigidMotion
 from vestcl.models.forecaster import Forecaster, Step
-from vestcl.models.prior import MotionPrior
+from vestcl.models.steps.prior import MotionPrior
 from vestcl.ops.unproject import unproject
 from vestcl.scene.layers import LayerBatch
 

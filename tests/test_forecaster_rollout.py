@@ -9,9 +9,9 @@ from torch.nn import functional
 
 from vestcl import geometry
 from vestcl.constants import SKY_DEPTH
-from vestcl.models._clouds import Cloud, advance
-from vestcl.models._perceive import perceive_forecast
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.steps.clouds import Cloud, advance
+from vestcl.models.steps.perceive import perceive_forecast
 from vestcl.scene.layers import LayerBatch
 
 # ---------------------------------------------------------------- further on

@@ -10,14 +10,15 @@ from forecaster_scenes import OBJECTS, SMALL, camera, frame, measured, pair_of, 
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models import configuration, skipping
-from vestcl.models._encode import encode
-from vestcl.models._render import _reaching
+from vestcl.models import configuration
 from vestcl.models.config import EncoderConfig, RenderConfig
-from vestcl.models.encoder import STRIDE, Encoder, reach
 from vestcl.models.forecaster import Forecaster, Step
-from vestcl.models.object_motion import ObjectMotion
-from vestcl.models.skipping import NOTHING, Box, Skip, Tally, boxes, count_skips
+from vestcl.models.inference import skipping
+from vestcl.models.inference.skipping import NOTHING, Box, Skip, Tally, boxes, count_skips
+from vestcl.models.networks.encoder import STRIDE, Encoder, reach
+from vestcl.models.networks.object_motion import ObjectMotion
+from vestcl.models.steps.encode import encode
+from vestcl.models.steps.render import _reaching
 from vestcl.scene.layers import LayerBatch
 
 #: As vest-s in all that can be skipped, and with convolutions that reach so little that a picture has room around it.

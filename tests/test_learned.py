@@ -12,7 +12,7 @@ import torch
 from forecaster_scenes import SMALL, change, stir
 from torch import nn
 
-from vestcl import geometric, learned_backtest, network, pretrained
+from vestcl import geometric, learned_backtest, network
 from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.forecast import LearnedPart, View
@@ -22,6 +22,7 @@ from vestcl.learned import CorrectedPaths, corrections, forecast_path, given_inp
 from vestcl.learned_backtest import choose_parts
 from vestcl.models.config import MOST_CHANGE, EgoMotionConfig
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.inference import pretrained
 
 HEIGHT, WIDTH = 48, 160
 RIGHT = np.eye(4)

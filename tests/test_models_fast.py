@@ -13,14 +13,22 @@ from forecaster_scenes import ABLATIONS, SMALL, TINY, camera, pair_of, stir, tur
 from torch.nn import functional
 
 from vestcl import metrics
-from vestcl.models import ModelConfig, ObjectMotion, fast
+from vestcl.models import ModelConfig, ObjectMotion
 from vestcl.models.config import ObjectMotionConfig
-from vestcl.models.effort import Effort
-from vestcl.models.fast import FastForecaster, JointConv, Precision, SharedMotionConv, accelerate, share_frames
 from vestcl.models.forecaster import Forecaster, Step
-from vestcl.models.object_motion import MotionConv
-from vestcl.models.skipping import NOTHING
-from vestcl.pretrained import load_model
+from vestcl.models.inference import fast
+from vestcl.models.inference.effort import Effort
+from vestcl.models.inference.fast import (
+    FastForecaster,
+    JointConv,
+    Precision,
+    SharedMotionConv,
+    accelerate,
+    share_frames,
+)
+from vestcl.models.inference.pretrained import load_model
+from vestcl.models.inference.skipping import NOTHING
+from vestcl.models.networks.object_motion import MotionConv
 
 #: Of images with values from 0 to 1, as `accelerate` promises.
 CLOSE = 1e-4

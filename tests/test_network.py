@@ -15,11 +15,11 @@ from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, Skipped, View
 from vestcl.geometric import Perception
 from vestcl.models.forecaster import Forecaster, perceive_estimated
-from vestcl.models.skipping import Count, Tally
+from vestcl.models.inference.skipping import Count, Tally
+from vestcl.models.inference.stage_times import REST, STAGES
 from vestcl.network import forecast_clip, forecast_frames, show_frame, what_was_skipped
 from vestcl.network_input import last_motions, network_input
 from vestcl.prepared import prepare_frame
-from vestcl.stages import REST, STAGES
 
 HEIGHT, WIDTH = 48, 160
 RIGHT = np.eye(4)

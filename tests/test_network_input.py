@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from vestcl import geometry
 from vestcl.data import Street
 from vestcl.geometric import Perception
-from vestcl.models.ego_motion import RigidMotion
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.networks.ego_motion import RigidMotion
 from vestcl.network_input import as_motion, last_motions, network_input
 from vestcl.prepared import Prepared, prepare_frame
 from vestcl.scene.layers import Layers

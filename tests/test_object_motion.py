@@ -1,4 +1,4 @@
-"""vestcl.models.object_motion: its size, the rigid flow at the start, metres at every scale, routing."""
+"""vestcl.models.networks.object_motion: its size, the rigid flow at the start, metres at every scale, routing."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from vestcl.models import ObjectMotion, budget_loss, configuration
 from vestcl.models.config import ObjectMotionConfig, RoutingConfig
-from vestcl.models.object_motion import MotionBlock, MotionConv, shrink
+from vestcl.models.networks.object_motion import MotionBlock, MotionConv, shrink
 
 FEATURES = 3
 

@@ -12,7 +12,7 @@ from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.forecast import View
 from vestcl.geometric import Perception, forecast_frames
-from vestcl.models.voxel_flow import VoxelFlowNetwork
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.views import parse_views
 
 SIZE = 48, 160

@@ -9,7 +9,7 @@ from vestcl.data import Street
 from vestcl.data.inputs import Inputs
 from vestcl.data.sample import Clip
 from vestcl.geometric import forecast_frames
-from vestcl.models.voxel_flow import VoxelFlowNetwork
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.peer import forecast_frames as peer_frames
 from vestcl.prepare_clip import EightBitPerception, prepare_clip
 from vestcl.prepared import PreparedClip

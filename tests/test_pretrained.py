@@ -7,9 +7,9 @@ import pytest
 import torch
 from forecaster_scenes import TINY
 
-from vestcl import pretrained
-from vestcl.models._checkpoint import write_checkpoint
+from vestcl.models.checkpoint import write_checkpoint
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.inference import pretrained
 
 #: The most that a file in the package may have, bytes.
 LARGEST = 20e6

@@ -6,16 +6,17 @@ import pytest
 import torch
 from forecaster_scenes import PAINTING, SMALL, TINY
 
-from vestcl import metrics, pretrained, quality
+from vestcl import metrics
 from vestcl.bench._pareto_knobs import Setting, describe
 from vestcl.bench._pareto_measure import step
 from vestcl.bench._pareto_scenes import Scene, scene
 from vestcl.bench._results import load
-from vestcl.models.effort import Effort
-from vestcl.models.fast import computes_bfloat16
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.skipping import Skip
-from vestcl.quality import LEVELS, LOSS, Quality
+from vestcl.models.inference import pretrained, quality
+from vestcl.models.inference.effort import Effort
+from vestcl.models.inference.fast import computes_bfloat16
+from vestcl.models.inference.quality import LEVELS, LOSS, Quality
+from vestcl.models.inference.skipping import Skip
 
 FIGURES = Path(__file__).parents[1] / "docs" / "time_against_error" / "pareto.json"
 

@@ -7,10 +7,11 @@ from forecast_clips import Repeater, write_clip
 from forecaster_scenes import SMALL
 from stand_ins import put_module
 
-from vestcl import cli, quality
+from vestcl import cli
 from vestcl.forecast_files import read_forecast
 from vestcl.models.forecaster import Forecaster
-from vestcl.quality import LEVELS, Quality
+from vestcl.models.inference import quality
+from vestcl.models.inference.quality import LEVELS, Quality
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""vestcl.models.refine: its size, its shapes, and what it adds to."""
+"""vestcl.models.networks.refine: its size, its shapes, and what it adds to."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from vestcl.models.config import (
     RefineConfig,
     RenderConfig,
 )
-from vestcl.models.refine import fill
+from vestcl.models.networks.refine import fill
 
 FEATURES = 3
 

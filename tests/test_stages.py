@@ -1,4 +1,4 @@
-"""vestcl.stages: stages timed without a change of the model, each thread's forecasts by themselves."""
+"""vestcl.models.inference.stage_times: stages timed without a change of the model, each thread's forecasts by themselves."""
 
 import copy
 import threading
@@ -16,12 +16,12 @@ from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.forecast import Forecast, View
 from vestcl.geometric import Perception
-from vestcl.models.fast import accelerate
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.skipping import Count, count_skips, current_tally
+from vestcl.models.inference.fast import accelerate
+from vestcl.models.inference.skipping import Count, count_skips, current_tally
+from vestcl.models.inference.stage_times import REST, STAGES, watching, with_rest
 from vestcl.network import forecast_clip, forecast_frames
 from vestcl.opencl import trace
-from vestcl.stages import REST, STAGES, watching, with_rest
 
 HEIGHT, WIDTH = 32, 64
 SOURCE = View("source", np.eye(4))

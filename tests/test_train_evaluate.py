@@ -28,9 +28,9 @@ from vestcl.data.readers.splits import (
     KITTI_VIEWS_TRAIN,
 )
 from vestcl.io import read_pixels
-from vestcl.models._checkpoint import write_checkpoint
+from vestcl.models.checkpoint import write_checkpoint
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.voxel_flow import VoxelFlowNetwork
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.scoring import GEOMETRIC, ORACLE, OTHER_CAMERA
 
 STREETS: dict[str, Any] = {

@@ -20,8 +20,8 @@ from vestcl.forecast import View
 from vestcl.geometric import Perception, forecast_frames
 from vestcl.models.config import configuration
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.models.trunks import Trunk
-from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.perceptual import LPIPS_SCALING, Lpips, StLpips, squeeze_distance
 from vestcl.scoring import GEOMETRIC, SOURCE, Truth
 from vestcl.views import parse_view

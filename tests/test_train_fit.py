@@ -20,7 +20,7 @@ from train.report import LOG, Reporter, read_log
 from vestcl.data import Street
 from vestcl.data.readers.splits import KITTI_VIEWS_TEST, KITTI_VIEWS_TRAIN
 from vestcl.models import ObjectMotion, config
-from vestcl.models._checkpoint import read_trained_on, write_checkpoint
+from vestcl.models.checkpoint import read_trained_on, write_checkpoint
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare_clip import prepare_clip
 

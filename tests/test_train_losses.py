@@ -17,7 +17,7 @@ from vestcl import geometry, metrics
 from vestcl.models import EgoMotion, ObjectMotion, RigidMotion
 from vestcl.models.config import RoutingConfig
 from vestcl.models.forecaster import Forecaster, RenderedView, Step
-from vestcl.models.prior import MotionPrior
+from vestcl.models.steps.prior import MotionPrior
 from vestcl.models.trunks import Trunk
 from vestcl.perceptual import VggLoss
 

@@ -14,7 +14,7 @@ from train import peer
 from train.data import Batch
 from train.fit import window_set
 from train.peer import LOG, STATE, WEIGHTS, PeerConfig, load_config, loss_of, pyramid_loss, train
-from vestcl.models.voxel_flow import VoxelFlowNetwork
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 
 SETTINGS: dict[str, Any] = {
     "name": "tiny",

@@ -18,7 +18,7 @@ from vestcl.data import Street
 from vestcl.forecast import View
 from vestcl.forecast_planes import forecast_planes
 from vestcl.geometric import Perception, forecast_frames
-from vestcl.models._checkpoint import read_trained_on
+from vestcl.models.checkpoint import read_trained_on
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare_command import open_input
 

@@ -12,7 +12,7 @@ from test_network_input import MOTIONS, displaced, prepared
 from video_files import write_video
 
 from train.data import WindowSet
-from vestcl import baselines, cli, compare, network, pretrained
+from vestcl import baselines, cli, compare, network
 from vestcl.bench import _forecast_run as running
 from vestcl.bench import forecast as bench
 from vestcl.data import Street
@@ -23,6 +23,7 @@ from vestcl.forecast_files import read_forecast
 from vestcl.geometric import Perception, forecast_frames
 from vestcl.io.images import to_pixels
 from vestcl.models.config import configuration
+from vestcl.models.inference import pretrained
 from vestcl.network_input import last_motions, network_input
 from vestcl.prepare_clip import EightBitPerception, frame_keys, prepare_clip
 from vestcl.prepared import PreparedClip, prepare_frame

@@ -1,4 +1,4 @@
-"""vestcl.models.voxel_flow: that the peer is the published network in size and shape, and computes what it should."""
+"""vestcl.models.networks.voxel_flow: that the peer is the published network in size and shape, and computes what it should."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from vestcl.models import voxel_flow
-from vestcl.models.voxel_flow import KEY, VoxelFlowBlock, VoxelFlowNetwork, warp
+from vestcl.models.networks import voxel_flow
+from vestcl.models.networks.voxel_flow import KEY, VoxelFlowBlock, VoxelFlowNetwork, warp
 
 
 def frames(batch: int = 1, height: int = 32, width: int = 48) -> tuple[torch.Tensor, torch.Tensor]:

@@ -29,8 +29,8 @@ from train.protocols import PROTOCOLS
 from train.report import LOG, read_log
 from vestcl import command_line, interrupt
 from vestcl.io.atomic import read_bytes, write_bytes
-from vestcl.models._checkpoint import read_checkpoint
-from vestcl.pretrained import find_model
+from vestcl.models.checkpoint import read_checkpoint
+from vestcl.models.inference.pretrained import find_model
 
 #: Rows of the log that is kept beside the card: a curve of some hundred pixels has no use for more.
 LOG_ROWS: Final = 300

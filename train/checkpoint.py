@@ -33,7 +33,7 @@ import vestcl
 from train.hashes import known_sha256, sha256
 from train.rng import restore_rng as restore_rng
 from train.rng import rng_state
-from vestcl.models._checkpoint import read_checkpoint, write_checkpoint
+from vestcl.models.checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models.config import ModelConfig
 
 #: Of the layout above; another one is not read.

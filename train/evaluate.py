@@ -40,8 +40,8 @@ from vestcl.data.street import input as street_input
 from vestcl.io.atomic import write_bytes
 from vestcl.metrics import MS_SSIM_SIDE
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.models.trunks import load_trunk
-from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.opencl import session as runtime
 from vestcl.perceptual import Lpips, StLpips
 from vestcl.prepare_command import shard

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from train.evaluate_windows import Part
-from vestcl.models._checkpoint import read_trained_on
+from vestcl.models.checkpoint import read_trained_on
 
 Sentences = tuple[str, ...]
 

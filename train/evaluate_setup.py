@@ -9,8 +9,8 @@ from train.protocols import Protocol
 from vestcl.data.later_frames import LaterFrames, Perceived, later_frames
 from vestcl.learned import Learned
 from vestcl.models.forecaster import Forecaster, Mode
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.models.trunks import Trunk
-from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.perceptual import Lpips, StLpips
 
 

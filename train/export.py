@@ -13,8 +13,8 @@ import tyro
 
 from train.command import ERRORS, failed
 from vestcl import command_line, interrupt
-from vestcl.models._checkpoint import read_trained_on, write_checkpoint
-from vestcl.pretrained import find_model, load_model
+from vestcl.models.checkpoint import read_trained_on, write_checkpoint
+from vestcl.models.inference.pretrained import find_model, load_model
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def export(checkpoint: Path, out: Path) -> None:
     """Write ``out``.
 
     Args:
-        checkpoint: as `vestcl.pretrained.load_model` takes it.
+        checkpoint: as `vestcl.models.inference.pretrained.load_model` takes it.
         out: the file.
 
     Raises:

@@ -31,10 +31,10 @@ from train.report import Reporter
 from train.trainer import Average, NotANumberError, Trainer, build_model
 from vestcl import command_line, interrupt
 from vestcl.data.readers.splits import KITTI_TRAINING
-from vestcl.models._checkpoint import Frames, read_trained_on
-from vestcl.models._weights import misfit
+from vestcl.models.checkpoint import Frames, read_trained_on
 from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.weights_file import misfit
 from vestcl.opencl import session as runtime
 from vestcl.prepared import find_prepared
 

@@ -16,8 +16,8 @@ from train.config import LossConfig
 from train.data import Batch
 from vestcl import metrics
 from vestcl.models import budget_loss
-from vestcl.models._layers import check
 from vestcl.models.forecaster import RenderedView, Step
+from vestcl.models.networks.layers import check
 from vestcl.models.trunks import load_trunk
 from vestcl.perceptual import VggLoss, squeeze_distance
 

@@ -1,6 +1,6 @@
 """Train the learned 2D peer: ``python -m train.peer train/configs/peer/dmvfn_street.yaml out=runs/dmvfn --resume``.
 
-A DMVFN-shaped network (`vestcl.models.voxel_flow`, all blocks, no routing) learns to forecast the source camera's next
+A DMVFN-shaped network (`vestcl.models.networks.voxel_flow`, all blocks, no routing) learns to forecast the source camera's next
 frame from two, on the windows that `train.fit` trains on. Out come ``peer.safetensors``, the EMA weights that
 `train.evaluate --peer` and `vestcl bench forecast --peer` read, ``log.jsonl``, and ``state.pt`` to resume from.
 """
@@ -30,7 +30,7 @@ from train.fit import window_set
 from train.losses import Perceptual, build_perceptual, image_terms
 from train.trainer import learning_rate_factor
 from vestcl.io import atomic
-from vestcl.models.voxel_flow import MULTIPLE, VoxelFlowNetwork
+from vestcl.models.networks.voxel_flow import MULTIPLE, VoxelFlowNetwork
 
 #: Files of a run.
 WEIGHTS: Final = "peer.safetensors"

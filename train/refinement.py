@@ -32,11 +32,11 @@ from train.losses import Perceptual, build_perceptual, image_terms
 from train.trainer import learning_rate_factor
 from vestcl import interrupt
 from vestcl.io import atomic
-from vestcl.models._checkpoint import read_trained_on, write_checkpoint
+from vestcl.models.checkpoint import read_trained_on, write_checkpoint
 from vestcl.models.config import ModelConfig, RefineConfig
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.refine import Refine
-from vestcl.pretrained import find_model, load_model
+from vestcl.models.inference.pretrained import find_model, load_model
+from vestcl.models.networks.refine import Refine
 
 #: Files of a run.
 WEIGHTS: Final = "vest.safetensors"

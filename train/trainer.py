@@ -15,8 +15,8 @@ from train.data import Batch
 from train.losses import Perceptual, total_loss
 from train.ranks import Ranks
 from vestcl.models.config import ModelConfig, configuration
-from vestcl.models.encoder import load_resnet34
 from vestcl.models.forecaster import Forecaster, RenderedView, Step
+from vestcl.models.networks.encoder import load_resnet34
 from vestcl.opencl import session as runtime
 
 _PRECISIONS: Final = {"float32": None, "bfloat16": torch.bfloat16}

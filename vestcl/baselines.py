@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from vestcl.models._layers import check
+from vestcl.models.networks.layers import check
 
 #: The finest scale of DIS flow: 0 is the full image. OpenCV's own choice, half the image, loses 0.1 to 0.3 dB at t+1.
 _FINEST_SCALE: Final = 0

@@ -18,7 +18,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from vestcl import baselines, forecast_files, geometric, metrics, network, pretrained, quality
+from vestcl import baselines, forecast_files, geometric, metrics, network
 from vestcl.compare import FORECAST
 from vestcl.data import Street
 from vestcl.data.sample import Clip
@@ -29,6 +29,7 @@ from vestcl.io import contact_sheet as sheet
 from vestcl.io.contact_sheet import Cell
 from vestcl.io.images import write_pixels
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.inference import pretrained, quality
 from vestcl.views import parse_views
 
 #: Frames up to the current one, all that the forecast looks at, and the rate, frames a second.
@@ -68,7 +69,7 @@ def run(
         height: rows of the pictures.
         width: columns of the pictures.
         seed: of the street.
-        model: NETWORK or any other that `vestcl.pretrained.load_model` knows, or GEOMETRIC; None is NETWORK where this
+        model: NETWORK or any other that `vestcl.models.inference.pretrained.load_model` knows, or GEOMETRIC; None is NETWORK where this
             installation has it, else GEOMETRIC.
         level: how exactly the network computes.
         steps: frames to forecast.

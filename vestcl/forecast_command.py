@@ -15,7 +15,7 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from vestcl import compare, forecast_checks, forecast_files, pretrained, quality
+from vestcl import compare, forecast_checks, forecast_files
 from vestcl.compare import Comparison
 from vestcl.data.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
 from vestcl.data.open import open_sequence
@@ -23,6 +23,7 @@ from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
 from vestcl.forecast import Forecast, Skipped, View
 from vestcl.io import contact_sheet as sheet
+from vestcl.models.inference import pretrained, quality
 from vestcl.models.trunks import load_trunk
 from vestcl.opencl import session as runtime
 from vestcl.options import check_pixels

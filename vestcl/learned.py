@@ -17,12 +17,12 @@ from vestcl import geometry
 from vestcl.forecast import LearnedPart, Rendered, View
 from vestcl.forecast_planes import forecast_planes
 from vestcl.geometric.paths import Paths
-from vestcl.models._render import looks_of
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.inference.stage_times import watching
+from vestcl.models.steps.render import looks_of
 from vestcl.network_input import PAST, CameraPath, NetworkInput, camera_path, last_motions, network_input
 from vestcl.prepared import prepare_frame
 from vestcl.scene.perception import Perception
-from vestcl.stages import watching
 
 Learned = Literal["tested", "all"]
 """Which learned parts a forecast has: those that pass the test, or all of them."""

@@ -17,12 +17,12 @@ from vestcl.learned import REFINEMENT, CorrectedPaths, Learned, chosen_motion, g
 from vestcl.learned_backtest import choose_parts
 from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
-from vestcl.models.skipping import Count, Tally, count_skips
+from vestcl.models.inference.skipping import Count, Tally, count_skips
+from vestcl.models.inference.stage_times import watching, with_rest
 from vestcl.network_input import NetworkInput
 from vestcl.prepared import prepare_frame
 from vestcl.scene.inpainting.inpainters import Inpainter
 from vestcl.scene.perception import Perception
-from vestcl.stages import watching, with_rest
 
 Progress = Callable[[str, float], None]
 

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 
 from vestcl import geometry
-from vestcl.models.camera_correction import INTERVAL, MEASURED, rates_of
-from vestcl.models.prior import MotionPrior
-from vestcl.models.rigid_motion import RigidMotion
+from vestcl.models.networks.camera_correction import INTERVAL, MEASURED, rates_of
+from vestcl.models.networks.rigid_motion import RigidMotion
+from vestcl.models.steps.prior import MotionPrior
 from vestcl.prepared import Prepared
 from vestcl.scene import _check
 from vestcl.scene.layers import LayerBatch, batch
@@ -29,7 +29,7 @@ class CameraPath(NamedTuple):
     future_from_cur: tuple[NDArray[np.float64], ...]
     """[4, 4] m each, after 1, 2 ... intervals."""
     measured: NDArray[np.float32]
-    """[MEASURED, RATES], see `vestcl.models.camera_correction.rates_of`."""
+    """[MEASURED, RATES], see `vestcl.models.networks.camera_correction.rates_of`."""
     seconds: float
     """An interval."""
 

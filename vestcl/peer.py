@@ -18,7 +18,7 @@ from vestcl.data.times import is_same
 from vestcl.forecast import Forecast, Rendered, View
 from vestcl.geometric import Perception, show_frame
 from vestcl.geometric import forecast_frames as geometric_frames
-from vestcl.models.voxel_flow import MULTIPLE, VoxelFlowNetwork
+from vestcl.models.networks.voxel_flow import MULTIPLE, VoxelFlowNetwork
 
 #: The name of this method in tables and files.
 METHOD: Final = "DMVFN shape"

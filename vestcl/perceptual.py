@@ -12,10 +12,10 @@ from typing import Final
 import torch
 from torch import nn
 
-from vestcl.models._layers import check
-from vestcl.models._weights import check_finite, read_state_dict
+from vestcl.models.networks.layers import check
 from vestcl.models.shift_tolerant import ShiftTolerantTrunk, load_shift_tolerant
 from vestcl.models.trunks import Normalisation, Trunk, load_trunk
+from vestcl.models.weights_file import check_finite, read_state_dict
 from vestcl.st_lpips import INSTALLED, REMEDY, find_weights
 
 #: LPIPS's own scaling layer, after 2 x - 1: ImageNet's mean and deviation on [-1, 1], in three digits.

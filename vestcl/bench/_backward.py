@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
-from vestcl.models._layers import tensors_in
-from vestcl.stages import REST
+from vestcl.models.inference.stage_times import REST
+from vestcl.models.networks.layers import tensors_in
 
 
 class BackwardWatch:
@@ -22,7 +22,7 @@ class BackwardWatch:
         self._began: list[tuple[float, str]] = []
 
     def seen(self, name: str, result: Any) -> None:
-        """Watch for the gradients of a stage's results; for `vestcl.stages.watching`."""
+        """Watch for the gradients of a stage's results; for `vestcl.models.inference.stage_times.watching`."""
         for tensor in tensors_in(result):
             if tensor.requires_grad:
                 tensor.register_hook(lambda _: self._began.append((time.perf_counter(), name)))

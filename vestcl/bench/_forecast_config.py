@@ -6,7 +6,7 @@ from typing import ClassVar, Final, Literal
 
 import tyro
 
-from vestcl.quality import Quality
+from vestcl.models.inference.quality import Quality
 from vestcl.st_lpips import Option as StLpipsOption
 
 #: Streets that nothing is tuned, trained or tested on: what "street:" stands for.

@@ -22,8 +22,8 @@ from vestcl.forecast_checks import check_input
 from vestcl.forecast_command import load_estimators, with_estimates
 from vestcl.geometric import Perception
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.models.trunks import Trunk
-from vestcl.models.voxel_flow import VoxelFlowNetwork
 from vestcl.perceptual import StLpips
 from vestcl.progress import Bar
 from vestcl.scoring import SOURCE, Record, Truth

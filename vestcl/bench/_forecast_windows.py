@@ -12,7 +12,7 @@ from vestcl import network
 from vestcl.forecast import Forecast, View
 from vestcl.geometric import Perception
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.voxel_flow import VoxelFlowNetwork
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.scoring import GEOMETRIC, ORACLE, SOURCE, Prediction, Predictions, Record, Truth, look, score
 from vestcl.scoring import predictions as all_predictions
 from vestcl.scoring.methods import TRUE_POSES, Method, forecasts_of

@@ -1,6 +1,6 @@
 """What makes the networks faster on a CPU, and what does not: a section of `vestcl bench network`.
 
-Every choice of `vestcl.models.fast` is timed in turns with the plain network, on the same input, and so are those that
+Every choice of `vestcl.models.inference.fast` is timed in turns with the plain network, on the same input, and so are those that
 were left out there because they do not pay: weights in channels-last order, both frames in one pass of the encoder, and
 torch.compile (Inductor with the machine's C++ compiler, weights frozen), which has to compile first.
 """
@@ -22,11 +22,11 @@ from torch import nn
 from vestcl.bench import _timing
 from vestcl.bench._results import Measure
 from vestcl.bench._timing import Spread
-from vestcl.models.fast import accelerate, computes_bfloat16, share_frames
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
-from vestcl.models.prior import MotionPrior
-from vestcl.models.skipping import NOTHING
+from vestcl.models.inference.fast import accelerate, computes_bfloat16, share_frames
+from vestcl.models.inference.skipping import NOTHING
+from vestcl.models.networks.object_motion import ObjectMotion, ObjectMotionForecast
+from vestcl.models.steps.prior import MotionPrior
 from vestcl.scene.layers import LayerBatch
 from vestcl.scoring.tables import Grid
 

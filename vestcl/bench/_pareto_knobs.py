@@ -5,9 +5,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from vestcl.models.effort import Effort
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.skipping import NOTHING, Skip
+from vestcl.models.inference.effort import Effort
+from vestcl.models.inference.skipping import NOTHING, Skip
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from torch.nn import functional
 from vestcl import geometry
 from vestcl.data import Street
 from vestcl.geometric import Perception
-from vestcl.models._layers import mapped
-from vestcl.models.effort import enlarged, fraction, reduced
+from vestcl.models.inference.effort import enlarged, fraction, reduced
+from vestcl.models.networks.layers import mapped
 from vestcl.network_input import NetworkInput, last_motions, network_input
 from vestcl.prepared import prepare_frame
 from vestcl.scene.layers import LayerBatch

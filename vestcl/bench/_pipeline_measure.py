@@ -18,11 +18,11 @@ from vestcl.bench._splatter import counting
 from vestcl.bench._timing import Spread
 from vestcl.bench._traffic import EMPTY, JAM, TRAFFIC, Drive, Window
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.skipping import NOTHING, Count, Skip, count_skips
-from vestcl.models.voxel_flow import VoxelFlowNetwork
+from vestcl.models.inference.skipping import NOTHING, Count, Skip, count_skips
+from vestcl.models.inference.stage_times import watching, with_rest
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.opencl import trace
 from vestcl.scene.layers import build_layers
-from vestcl.stages import watching, with_rest
 
 #: What else is timed beside the variants: the peer, a copy of the frames' layers, and what a new frame needs before.
 PEER, COPY, INPAINT = "DMVFN", "copy", "inpaint"

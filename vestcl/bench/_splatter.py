@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from vestcl import reference
-from vestcl.models import _render
+from vestcl.models.steps import render as _render
 from vestcl.ops.splat import Skipped, rasterize, skipped
 
 #: Image and coverage; and what shows features, on a background, down to a transmittance.

@@ -20,7 +20,7 @@ import torch
 
 from vestcl.data import Street
 from vestcl.data.street.driving.drive import MAX_CHANGE, Sway
-from vestcl.models.prior import nothing_moves
+from vestcl.models.steps.prior import nothing_moves
 from vestcl.network_input import NetworkInput, last_motions, network_input
 from vestcl.prepared import Prepared, prepare_frame
 from vestcl.scene.layers import LayerBatch

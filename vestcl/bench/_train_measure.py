@@ -16,13 +16,13 @@ from vestcl.bench._splatter import by_twin
 from vestcl.bench._timing import Spread
 from vestcl.bench._traffic import Window
 from vestcl.bench.network import LEARNING_RATE
-from vestcl.models._layers import joined
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.prior import MotionPrior
+from vestcl.models.inference.stage_times import watching, with_rest
+from vestcl.models.networks.layers import joined
+from vestcl.models.steps.prior import MotionPrior
 from vestcl.opencl import session as runtime
 from vestcl.opencl import trace
 from vestcl.scene.layers import LayerBatch
-from vestcl.stages import watching, with_rest
 
 #: Variant -> networks that are frozen, by their attributes of `Forecaster`. Autograd records nothing that leads to a
 #: frozen one alone, and OpenCL's backward computes no gradient that nobody asks for.

@@ -24,7 +24,7 @@ from vestcl.data.street.raycast import SKY_DEPTH
 from vestcl.io.labels import background
 from vestcl.models import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster, Step
-from vestcl.models.prior import MotionPrior, nothing_moves
+from vestcl.models.steps.prior import MotionPrior, nothing_moves
 from vestcl.opencl import session as runtime
 from vestcl.scene import layers
 from vestcl.scene.layers import LayerBatch

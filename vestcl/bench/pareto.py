@@ -8,14 +8,14 @@ from typing import Any, Final
 
 from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from vestcl import pretrained, quality
 from vestcl.bench import _pareto_plots, _pareto_report, _pareto_splatter, _results, _timing
 from vestcl.bench._pareto_front import PRICE, front, knee
 from vestcl.bench._pareto_knobs import EXACT, Knob, Setting, combinations, describe, knobs
 from vestcl.bench._pareto_measure import Bench, measure, recursions
 from vestcl.bench._pareto_scenes import scene
 from vestcl.bench._results import Results
-from vestcl.models.fast import accelerate
+from vestcl.models.inference import pretrained, quality
+from vestcl.models.inference.fast import accelerate
 from vestcl.opencl import session as runtime
 from vestcl.progress import Bar
 
@@ -43,7 +43,7 @@ class ParetoBench:
     runs: int = 5
     """Of each setting, after two that don't count."""
     accelerated: bool = True
-    """The network as `vestcl.models.fast.accelerate` lays it out."""
+    """The network as `vestcl.models.inference.fast.accelerate` lays it out."""
     combine: bool = True
     """Combine the knobs' knees, too."""
     splatter: bool = True

@@ -8,15 +8,15 @@ from typing import Final, Literal
 import torch
 from rich.console import Console
 
-from vestcl import pretrained, quality
 from vestcl.bench import _pipeline_report, _plots, _results, _timing
 from vestcl.bench._pipeline_measure import SceneTimes, measure_scene
 from vestcl.bench._results import Results
 from vestcl.bench._traffic import EMPTY, EVERYTHING, JAM, LEAST_FRAMES, TRAFFIC, drive
 from vestcl.bench.network import peak_gigabytes
-from vestcl.models import voxel_flow
-from vestcl.models.fast import accelerate
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.inference import pretrained, quality
+from vestcl.models.inference.fast import accelerate
+from vestcl.models.networks import voxel_flow
 from vestcl.opencl import session as runtime
 from vestcl.opencl import trace
 
@@ -43,11 +43,11 @@ class PipelineBench:
     seconds: float = 60.0
     """About how long each scene takes."""
     quality: Literal["exact", "balanced", "fast"] = "balanced"
-    """Of the forecast, with everything skipped and with nothing alike: see `vestcl.quality`."""
+    """Of the forecast, with everything skipped and with nothing alike: see `vestcl.models.inference.quality`."""
     precision: Literal["float32", "bfloat16"] | None = None
     """That encoder and refinement compute in; None is the quality's, where the processor has it."""
     accelerated: bool = True
-    """The network as `vestcl.models.fast.accelerate` lays it out."""
+    """The network as `vestcl.models.inference.fast.accelerate` lays it out."""
     peers: bool = True
     """Beside DMVFN's network on the same frames, too."""
     threads: int = 2

@@ -97,7 +97,7 @@ class EgoMotionConfig:
     """Frame intervals ahead that the camera's motion is forecast for in one go; more than one needs a prior."""
     correction: Literal["linear", "bounded"] = "linear"
     """How a prior is corrected: "linear" in the last two motions, at one frame rate; or "bounded" by what a car can do
-    within the time between frames, which is an input, and gated (`vestcl.models.camera_correction`)."""
+    within the time between frames, which is an input, and gated (`vestcl.models.networks.camera_correction`)."""
 
     def __post_init__(self) -> None:
         if self.correction not in ("linear", "bounded"):

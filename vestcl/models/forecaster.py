@@ -6,18 +6,18 @@ from typing import get_args
 
 import torch
 
-from vestcl.models._checkpoint import read_checkpoint, write_checkpoint
-from vestcl.models._clouds import Cloud, advance
-from vestcl.models._frames import check_frames
-from vestcl.models._layers import check
-from vestcl.models._motion import Motion, Step, arrived, next_prior
-from vestcl.models._perceive import Perceive, known_view, perceive_estimated, perceive_forecast, perceive_view
-from vestcl.models._render import Camera, RenderedView, checked_camera
-from vestcl.models._stages import Stages
-from vestcl.models._weights import misfit
+from vestcl.models.checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models.config import Mode
-from vestcl.models.prior import MotionPrior, check_prior
-from vestcl.models.skipping import current_tally
+from vestcl.models.inference.skipping import current_tally
+from vestcl.models.networks.layers import check
+from vestcl.models.stages import Stages
+from vestcl.models.steps.clouds import Cloud, advance
+from vestcl.models.steps.frames import check_frames
+from vestcl.models.steps.motion import Motion, Step, arrived, next_prior
+from vestcl.models.steps.perceive import Perceive, known_view, perceive_estimated, perceive_forecast, perceive_view
+from vestcl.models.steps.prior import MotionPrior, check_prior
+from vestcl.models.steps.render import Camera, RenderedView, checked_camera
+from vestcl.models.weights_file import misfit
 from vestcl.scene.layers import LayerBatch
 
 __all__ = [

@@ -11,8 +11,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models._layers import check
-from vestcl.models._weights import check_finite, misfit, read_state_dict
+from vestcl.models.networks.layers import check
+from vestcl.models.weights_file import check_finite, misfit, read_state_dict
 
 #: Channels of the five maps, each after a ReLU.
 CHANNELS: Final = (64, 192, 384, 256, 256)

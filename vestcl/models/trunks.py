@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from vestcl.models._layers import check
-from vestcl.models._weights import check_finite, read_state_dict, unwrapped
+from vestcl.models.networks.layers import check
+from vestcl.models.weights_file import check_finite, read_state_dict, unwrapped
 
 
 class Normalisation(NamedTuple):

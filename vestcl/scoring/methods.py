@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vestcl import peer
 from vestcl.forecast import Forecast, View
 from vestcl.geometric import Perception, forecast_frames
-from vestcl.models.voxel_flow import VoxelFlowNetwork
+from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.scoring.pictures import GEOMETRIC, Timed
 
 #: The geometric forecast with the camera's true motion.

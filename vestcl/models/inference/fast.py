@@ -15,15 +15,15 @@ from typing import Any, Final, Literal, get_args
 import torch
 from torch.nn import functional
 
-from vestcl.models._layers import tensors_in
-from vestcl.models._weights import unwrapped
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.object_motion import (
+from vestcl.models.networks.layers import tensors_in
+from vestcl.models.networks.object_motion import (
     MOTION_CHANNELS,
     MotionBlock,
     MotionConv,
     ObjectMotion,
 )
+from vestcl.models.weights_file import unwrapped
 
 __all__ = ["FastForecaster", "Precision", "accelerate", "computes_bfloat16", "keep_freed_memory", "share_frames"]
 

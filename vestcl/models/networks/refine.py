@@ -7,7 +7,6 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models._layers import channels_last, check, group_norm, side_by_side, upsample
 from vestcl.models.config import (
     FORECAST_PLANES,
     LEAST_COVERAGE,
@@ -17,6 +16,7 @@ from vestcl.models.config import (
     RefineConfig,
     RenderConfig,
 )
+from vestcl.models.networks.layers import channels_last, check, group_norm, side_by_side, upsample
 
 
 class Refine(nn.Module):

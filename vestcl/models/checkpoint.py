@@ -13,8 +13,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from vestcl.io import atomic
-from vestcl.models._weights import check_finite, unwrapped
 from vestcl.models.config import ModelConfig
+from vestcl.models.weights_file import check_finite, unwrapped
 
 #: The metadata's entry that holds the configuration, and the one that holds the clips that the model was trained on.
 KEY: Final = "vestcl.config"

@@ -7,11 +7,11 @@ from typing import Final, NamedTuple
 import torch
 from torch.nn import functional
 
-from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
 from vestcl.models.config import LOG_DEPTH_FAR
-from vestcl.models.ego_motion import CameraMotion
-from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
-from vestcl.models.skipping import Box, Skip, Tally, boxes
+from vestcl.models.inference.skipping import Box, Skip, Tally, boxes
+from vestcl.models.networks.ego_motion import CameraMotion
+from vestcl.models.networks.object_motion import ObjectMotion, ObjectMotionForecast
+from vestcl.models.steps.frames import FOREGROUND_BELOW, EncodedFrame
 
 #: From t - 1 and from t to t + 1; OMF runs at the interval that it learned at, of evenly spaced frames.
 _INTERVALS: Final = (2, 1)

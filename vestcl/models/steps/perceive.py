@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from vestcl.constants import SKY_DEPTH
 from vestcl.io.labels import SKY, background
-from vestcl.models._frames import FOREGROUND_BELOW
-from vestcl.models._render import Camera, RenderedView
+from vestcl.models.steps.frames import FOREGROUND_BELOW
+from vestcl.models.steps.render import Camera, RenderedView
 from vestcl.scene import layers
 from vestcl.scene.estimators.sources import CheckedClasses, CheckedDepth
 from vestcl.scene.inpainting.inpainters import Inpainter

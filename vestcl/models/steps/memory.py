@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 import torch
 
-from vestcl.models._frames import EncodedFrame
+from vestcl.models.steps.frames import EncodedFrame
 from vestcl.scene.layers import LayerBatch
 
 #: Frames that are kept for each thread: the next step's two inputs.

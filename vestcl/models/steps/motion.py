@@ -7,12 +7,12 @@ import torch
 from torch.nn import functional
 
 from vestcl import geometry
-from vestcl.models._clouds import as_image, as_points, in_plane
-from vestcl.models._frames import EncodedFrame
-from vestcl.models._render import RenderedView
-from vestcl.models.ego_motion import CameraMotion, RigidMotion
-from vestcl.models.object_motion import ObjectMotionForecast
-from vestcl.models.prior import MotionPrior, repeated
+from vestcl.models.networks.ego_motion import CameraMotion, RigidMotion
+from vestcl.models.networks.object_motion import ObjectMotionForecast
+from vestcl.models.steps.clouds import as_image, as_points, in_plane
+from vestcl.models.steps.frames import EncodedFrame
+from vestcl.models.steps.prior import MotionPrior, repeated
+from vestcl.models.steps.render import RenderedView
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
 

@@ -8,10 +8,10 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models._layers import channels_last, check, group_norm, side_by_side, upsample
-from vestcl.models._norm import Normalise, own
-from vestcl.models._weights import check_finite, read_state_dict, some_of
 from vestcl.models.config import ENCODER_GROUP, EncoderConfig
+from vestcl.models.networks.group_norm import Normalise, own
+from vestcl.models.networks.layers import channels_last, check, group_norm, side_by_side, upsample
+from vestcl.models.weights_file import check_finite, read_state_dict, some_of
 
 #: Pixels of the image a cell of the features, in both directions.
 STRIDE: Final = 4
@@ -60,7 +60,7 @@ class Encoder(nn.Module):
 
         Args:
             image: [B, 3, H, W] RGB in [0, 1], of any size.
-            norm: by which statistics it is normalised: `vestcl.models._norm`.
+            norm: by which statistics it is normalised: `vestcl.models.networks.group_norm`.
 
         Returns:
             features [B, features, ceil(H / 4), ceil(W / 4)]; differentiable. `upsample_features` brings them to H x W.

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, get_args
 
 import torch
 
-from vestcl import pretrained
-from vestcl.models.effort import Effort
-from vestcl.models.fast import FastForecaster, accelerate, computes_bfloat16, keep_freed_memory
-from vestcl.models.skipping import Skip
+from vestcl.models.inference import pretrained
+from vestcl.models.inference.effort import Effort
+from vestcl.models.inference.fast import FastForecaster, accelerate, computes_bfloat16, keep_freed_memory
+from vestcl.models.inference.skipping import Skip
 
 if TYPE_CHECKING:
     from vestcl.models.forecaster import Forecaster
@@ -109,7 +109,7 @@ def load(name_or_path: str | Path, quality: Quality) -> FastForecaster:
     """A trained network as commands use it: at ``quality``, laid out for inference; the process keeps what it frees.
 
     Args:
-        name_or_path: see `vestcl.pretrained.load_model`.
+        name_or_path: see `vestcl.models.inference.pretrained.load_model`.
         quality: one of `LEVELS`.
 
     Raises:

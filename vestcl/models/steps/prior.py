@@ -6,11 +6,11 @@ from typing import NamedTuple
 import torch
 
 from vestcl import geometry
-from vestcl.models._clouds import as_image, as_points
-from vestcl.models._layers import check
-from vestcl.models._render import RenderedView
-from vestcl.models.camera_correction import MEASURED, RATES, CameraPrior
-from vestcl.models.rigid_motion import RigidMotion
+from vestcl.models.networks.camera_correction import MEASURED, RATES, CameraPrior
+from vestcl.models.networks.layers import check
+from vestcl.models.networks.rigid_motion import RigidMotion
+from vestcl.models.steps.clouds import as_image, as_points
+from vestcl.models.steps.render import RenderedView
 from vestcl.ops.unproject import unproject
 
 
@@ -37,7 +37,7 @@ class MotionPrior(NamedTuple):
     """[B, n, 4] and [B, n, 3]: the camera's of the n intervals after t + 1, extrapolated; then the last one that is
     known repeats."""
     measured: torch.Tensor | None = None
-    """[B, MEASURED, RATES], the last motions as `vestcl.models.camera_correction.rates_of` gives them, oldest first;
+    """[B, MEASURED, RATES], the last motions as `vestcl.models.networks.camera_correction.rates_of` gives them, oldest first;
     None is the two above."""
     seconds: torch.Tensor | None = None
     """[B] s, one interval of the clip; None is 0.1."""

@@ -8,8 +8,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models._layers import channels_last, check, frame_pair, side_by_side, upsample
 from vestcl.models.config import ObjectMotionConfig, RoutingConfig
+from vestcl.models.networks.layers import channels_last, check, frame_pair, side_by_side, upsample
 
 #: Motion of both frames to t + 1: xyz of the previous one, xyz of the current one.
 MOTION_CHANNELS: Final = 6
@@ -57,7 +57,7 @@ class ObjectMotion(nn.Module):
         )
         self.routing = None if config.routing is None else Routing(frames, len(config.scales), config.routing)
         self.multiple = math.lcm(*config.scales) * (_DMVFN_STRIDE if config.shape == "dmvfn" else 1)
-        #: What blocks get in place of the frames, at each scale, and how many of them: `vestcl.models.fast` sets both.
+        #: What blocks get in place of the frames, at each scale, and how many of them: `vestcl.models.inference.fast` sets both.
         self.shared: Callable[[torch.Tensor], Any] | None = None
         self.sharing = 0
 

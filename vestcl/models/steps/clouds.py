@@ -10,8 +10,8 @@ import torch
 from torch.nn import functional
 
 from vestcl import constants, geometry
-from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
-from vestcl.models.ego_motion import RigidMotion
+from vestcl.models.networks.ego_motion import RigidMotion
+from vestcl.models.steps.frames import FOREGROUND_BELOW, EncodedFrame
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
 

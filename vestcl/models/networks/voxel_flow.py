@@ -23,7 +23,7 @@ from torch import nn
 from torch.nn import functional
 
 from vestcl.io import atomic
-from vestcl.models._weights import check_finite, misfit, read_state_dict
+from vestcl.models.weights_file import check_finite, misfit, read_state_dict
 
 #: Of the nine blocks: each sees the frames at 1 / S of their size beside a narrow branch at full size.
 SCALES: Final = (4, 4, 4, 2, 2, 2, 1, 1, 1)

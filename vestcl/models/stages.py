@@ -8,14 +8,23 @@ import torch
 from torch import nn
 
 from vestcl import geometry
-from vestcl.models._clouds import Cloud, as_image, join, lift, lift_hidden
-from vestcl.models._encode import encode
-from vestcl.models._frames import EncodedFrame, grid_depth, grid_mean, with_depth
-from vestcl.models._layers import side_by_side
-from vestcl.models._memory import Memory, State
-from vestcl.models._motion import Motion, flattened, without_z
-from vestcl.models._objects import move_objects, unmoved
-from vestcl.models._render import (
+from vestcl.models.config import OPAQUE, ModelConfig
+from vestcl.models.inference.effort import Effort, enlarged, fraction, reduced
+from vestcl.models.inference.skipping import Skip, current_tally
+from vestcl.models.inference.stage_times import timed
+from vestcl.models.networks.ego_motion import CameraMotion, EgoMotion, RigidMotion
+from vestcl.models.networks.encoder import Encoder
+from vestcl.models.networks.layers import side_by_side
+from vestcl.models.networks.object_motion import ObjectMotion, ObjectMotionForecast
+from vestcl.models.networks.refine import Refine
+from vestcl.models.steps.clouds import Cloud, as_image, join, lift, lift_hidden
+from vestcl.models.steps.encode import encode
+from vestcl.models.steps.frames import EncodedFrame, grid_depth, grid_mean, with_depth
+from vestcl.models.steps.memory import Memory, State
+from vestcl.models.steps.motion import Motion, flattened, without_z
+from vestcl.models.steps.move_objects import move_objects, unmoved
+from vestcl.models.steps.prior import MotionPrior, beside
+from vestcl.models.steps.render import (
     Camera,
     RenderedView,
     Side,
@@ -25,18 +34,9 @@ from vestcl.models._render import (
     refined_channels,
     splat_cloud,
 )
-from vestcl.models.config import OPAQUE, ModelConfig
-from vestcl.models.effort import Effort, enlarged, fraction, reduced
-from vestcl.models.ego_motion import CameraMotion, EgoMotion, RigidMotion
-from vestcl.models.encoder import Encoder
-from vestcl.models.object_motion import ObjectMotion, ObjectMotionForecast
-from vestcl.models.prior import MotionPrior, beside
-from vestcl.models.refine import Refine
-from vestcl.models.skipping import Skip, current_tally
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
 from vestcl.scene.layers import LayerBatch
-from vestcl.stages import timed
 
 
 class Stages(nn.Module):
@@ -56,7 +56,7 @@ class Stages(nn.Module):
         #: Encoder and refinement compute in this type (torch.bfloat16, or None for the parameters' own): motion, which
         #: is millimetres in hundreds of metres, never does.
         self.autocast: torch.dtype | None = None
-        #: What is not computed where a scene does not need it; `vestcl.models.skipping.count_skips` counts it.
+        #: What is not computed where a scene does not need it; `vestcl.models.inference.skipping.count_skips` counts it.
         self.skip = Skip()
         #: What is computed more coarsely than the network was trained to.
         self.effort = Effort()

@@ -6,10 +6,10 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models._layers import frame_pair, frame_planes, side_by_side
-from vestcl.models.camera_correction import BoundedCorrection, CameraPrior, as_prior
 from vestcl.models.config import EgoMotionConfig
-from vestcl.models.rigid_motion import CameraMotion, RigidMotion
+from vestcl.models.networks.camera_correction import BoundedCorrection, CameraPrior, as_prior
+from vestcl.models.networks.layers import frame_pair, frame_planes, side_by_side
+from vestcl.models.networks.rigid_motion import CameraMotion, RigidMotion
 
 __all__ = ["CameraMotion", "EgoMotion", "RigidMotion", "background_tokens", "sinusoidal_positions"]
 

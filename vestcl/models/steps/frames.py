@@ -6,8 +6,8 @@ import torch
 from torch.nn import functional
 
 from vestcl import constants
-from vestcl.models._layers import check
-from vestcl.models.encoder import STRIDE, upsample_features
+from vestcl.models.networks.encoder import STRIDE, upsample_features
+from vestcl.models.networks.layers import check
 from vestcl.scene.layers import LayerBatch
 
 #: A mask's pixel below is foreground, whatever a resize made of 0 and 1.

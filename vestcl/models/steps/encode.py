@@ -3,11 +3,11 @@
 import torch
 from torch.nn import functional
 
-from vestcl.models._frames import FOREGROUND_BELOW, EncodedFrame
-from vestcl.models._norm import NotedStatistics
 from vestcl.models.config import EncoderConfig
-from vestcl.models.encoder import COARSEST, STRIDE, Encoder, reach, upsample_features
-from vestcl.models.skipping import Box, Skip, Tally, boxes
+from vestcl.models.inference.skipping import Box, Skip, Tally, boxes
+from vestcl.models.networks.encoder import COARSEST, STRIDE, Encoder, reach, upsample_features
+from vestcl.models.networks.group_norm import NotedStatistics
+from vestcl.models.steps.frames import FOREGROUND_BELOW, EncodedFrame
 from vestcl.scene.layers import LayerBatch
 
 

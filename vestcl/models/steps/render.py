@@ -9,10 +9,10 @@ import torch
 
 from vestcl import constants
 from vestcl.constants import SKY_DEPTH
-from vestcl.models._clouds import Cloud, Grid, last_motion
-from vestcl.models._layers import check, side_by_side
 from vestcl.models.config import LEAST_COVERAGE, RenderConfig
-from vestcl.models.skipping import Tally
+from vestcl.models.inference.skipping import Tally
+from vestcl.models.networks.layers import check, side_by_side
+from vestcl.models.steps.clouds import Cloud, Grid, last_motion
 from vestcl.ops.displace import displace
 from vestcl.ops.splat import composite, rasterize
 from vestcl.ops.stretch import stretch
@@ -136,7 +136,7 @@ def splat_cloud(
         open_: bool [B, 1, H, W], the pixels that count: others may be left empty. None is all.
         tally: is told how many points reach none of them, and are left out; None leaves out none.
         deep: bool [B, 1, H, W], the pixels where inpainted points count, from `inner_holes`; None is all.
-        flat: motion is a 2D flow, see `vestcl.models._clouds.in_plane`.
+        flat: motion is a 2D flow, see `vestcl.models.steps.clouds.in_plane`.
 
     Returns:
         What is seen; differentiable in the cloud, through positions, radii and inverse depth.

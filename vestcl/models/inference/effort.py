@@ -1,7 +1,7 @@
 """How much a forecast may cost: what a trained network may compute more coarsely, with the weights that it has.
 
 `Skip` leaves out what changes nothing; this leaves out what changes something. `vestcl bench pareto` measures how much
-each field costs and saves, and `vestcl.quality` chooses by that.
+each field costs and saves, and `vestcl.models.inference.quality` chooses by that.
 """
 
 import math

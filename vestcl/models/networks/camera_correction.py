@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import torch
 from torch import nn
 
-from vestcl.models.rigid_motion import RigidMotion
+from vestcl.models.networks.rigid_motion import RigidMotion
 
 #: Rad/s by which a forecast rate of rotation may be wrong: a steering wheel is turned within a second, and kerbs and
 #: bumps tilt a car by degrees at 1 to 2 Hz.
@@ -43,7 +43,7 @@ _ROLLING: Final = 5.0
 
 
 class CameraPrior(NamedTuple):
-    """What is known of a camera's motion before a network looks: see `vestcl.models.prior.MotionPrior`."""
+    """What is known of a camera's motion before a network looks: see `vestcl.models.steps.prior.MotionPrior`."""
 
     next_from_cur: RigidMotion
     cur_from_prev: RigidMotion
