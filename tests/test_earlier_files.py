@@ -14,7 +14,7 @@ from train import fit
 from vestcl import cli
 from vestcl.models import config
 from vestcl.models.inference.pretrained import load_model
-from vestcl.prepared import find_prepared
+from vestcl.prepare.prepared import find_prepared
 
 EARLIER = Path(__file__).parent / "earlier"
 CHECKPOINT = "checkpoints/step-00000002"

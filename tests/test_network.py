@@ -19,7 +19,7 @@ from vestcl.models.inference.skipping import Count, Tally
 from vestcl.models.inference.stage_times import REST, STAGES
 from vestcl.network import forecast_clip, forecast_frames, show_frame, what_was_skipped
 from vestcl.network_input import last_motions, network_input
-from vestcl.prepared import prepare_frame
+from vestcl.prepare.prepared import prepare_frame
 
 HEIGHT, WIDTH = 48, 160
 RIGHT = np.eye(4)

@@ -15,7 +15,7 @@ from vestcl.geometric import Perception
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.ego_motion import RigidMotion
 from vestcl.network_input import as_motion, last_motions, network_input
-from vestcl.prepared import Prepared, prepare_frame
+from vestcl.prepare.prepared import Prepared, prepare_frame
 from vestcl.scene.layers import Layers
 from vestcl.scene.motion.ego_motion import constant_velocity
 

@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 from prepare_scenes import COMMAND, FRAMES, HEIGHT, ROOT, SMALL, WIDTH, contents, options, run, told, until, write_drive
 
-from vestcl import prepare_clip, prepare_command
+from vestcl import prepare_command
 from vestcl.data import calibration
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageArray
 from vestcl.io.images import read_pixels, to_pixels, write_pixels
 from vestcl.io.video.writing import write_mp4
-from vestcl.prepare_clip import frame_keys
-from vestcl.prepared import PreparedClip, find_prepared, prepare_frame
-from vestcl.prepared_files import frame_path
+from vestcl.prepare import clip as prepare_clip
+from vestcl.prepare.clip import frame_keys
+from vestcl.prepare.files import frame_path
+from vestcl.prepare.prepared import PreparedClip, find_prepared, prepare_frame
 from vestcl.scene.estimators import with_estimates
 from vestcl.scene.perception import Perception
 

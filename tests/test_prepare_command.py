@@ -13,9 +13,9 @@ from prepare_scenes import FRAMES, HEIGHT, SMALL, WIDTH, contents, counted, opti
 
 from vestcl import cli, prepare_command
 from vestcl.io.images import write_pixels
-from vestcl.prepare_clip import frame_keys
-from vestcl.prepared import find_prepared
-from vestcl.prepared_files import frame_path
+from vestcl.prepare.clip import frame_keys
+from vestcl.prepare.files import frame_path
+from vestcl.prepare.prepared import find_prepared
 
 
 @pytest.fixture

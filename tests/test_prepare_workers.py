@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from prepare_scenes import COMMAND, FRAMES, HEIGHT, ROOT, SMALL, WIDTH, contents, counted, options, run, until
 
-from vestcl.prepared_files import frame_path
+from vestcl.prepare.files import frame_path
 
 
 def test_two_at_once_compute_every_frame_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

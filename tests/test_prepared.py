@@ -11,9 +11,9 @@ from vestcl.constants import SKY_DEPTH
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
 from vestcl.io.images import to_float, to_pixels
-from vestcl.prepare_clip import EightBitPerception, prepare_clip
-from vestcl.prepared import Prepared, PreparedClip, find_prepared, prepare_frame
-from vestcl.prepared_files import frame_path, read_tensors, write_clip, write_frame
+from vestcl.prepare.clip import EightBitPerception, prepare_clip
+from vestcl.prepare.files import frame_path, read_tensors, write_clip, write_frame
+from vestcl.prepare.prepared import Prepared, PreparedClip, find_prepared, prepare_frame
 from vestcl.scene.layers import Layers
 
 HEIGHT, WIDTH, FRAMES = 48, 160, 3

@@ -1,4 +1,4 @@
-"""vestcl.prepared_perception: prepared clips in place of recorded ones."""
+"""vestcl.prepare.perception: prepared clips in place of recorded ones."""
 
 from pathlib import Path
 
@@ -11,9 +11,9 @@ from vestcl.data.sample import Clip
 from vestcl.geometric import forecast_frames
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.peer import forecast_frames as peer_frames
-from vestcl.prepare_clip import EightBitPerception, prepare_clip
-from vestcl.prepared import PreparedClip
-from vestcl.prepared_perception import PreparedPerception, PreparedSequence, as_clip
+from vestcl.prepare.clip import EightBitPerception, prepare_clip
+from vestcl.prepare.perception import PreparedPerception, PreparedSequence, as_clip
+from vestcl.prepare.prepared import PreparedClip
 from vestcl.views import parse_views
 
 SIZE = 48, 160

@@ -16,7 +16,7 @@ from vestcl.data import Street
 from vestcl.io import depth, exr, images
 from vestcl.io.atomic import write_bytes
 from vestcl.models.forecaster import Forecaster
-from vestcl.prepare_clip import prepare_clip
+from vestcl.prepare.clip import prepare_clip
 
 PICTURE = np.zeros((32, 32, 3), np.uint8)
 

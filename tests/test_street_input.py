@@ -17,9 +17,9 @@ from vestcl.data.street.input import Driven, parse
 from vestcl.data.street.raycast import FOREGROUND
 from vestcl.data.street.sensors import DisturbedLabels, StreetScan
 from vestcl.opencl import session as runtime
-from vestcl.prepare_clip import frame_keys
+from vestcl.prepare.clip import frame_keys
+from vestcl.prepare.prepared import find_prepared
 from vestcl.prepare_command import open_input, plan
-from vestcl.prepared import find_prepared
 
 SIZE = HEIGHT, WIDTH = 48, 160
 

@@ -23,7 +23,7 @@ from train.report import LOG
 from vestcl.data import Street
 from vestcl.io.images import read_pixels, write_pixels
 from vestcl.models.forecaster import Forecaster
-from vestcl.prepared_files import JSON, RECIPE
+from vestcl.prepare.files import JSON, RECIPE
 from vestcl.scoring import GEOMETRIC, Record
 
 FRAMES, STEP = 6, 0.8

@@ -20,8 +20,8 @@ from vestcl.data import Street
 from vestcl.models.forecaster import Forecaster
 from vestcl.network_input import last_motions, network_input
 from vestcl.ops.unproject import unproject
-from vestcl.prepare_clip import prepare_clip
-from vestcl.prepared import Prepared, PreparedClip, find_prepared
+from vestcl.prepare.clip import prepare_clip
+from vestcl.prepare.prepared import Prepared, PreparedClip, find_prepared
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -208,7 +208,7 @@ def test_reading_opens_no_device(cache: Path) -> None:
     code = (
         "import sys\n"
         "from train.data import WindowSet, loader\n"
-        "from vestcl.prepared import find_prepared\n"
+        "from vestcl.prepare.prepared import find_prepared\n"
         "windows = WindowSet(find_prepared(sys.argv[1]), crop=(24, 80), flip=True, colour=0.5, right=0.5)\n"
         "assert len(list(loader(windows, 0, 2, range(2)))) == 2\n"
         "assert 'libpocl' not in open('/proc/self/maps').read()"

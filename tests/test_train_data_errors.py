@@ -8,8 +8,8 @@ from test_train_data import HEIGHT, WIDTH, FakeClip, fakes
 
 from train.data import Draw, WindowSet, loader
 from vestcl.data import Street
-from vestcl.prepare_clip import prepare_clip
-from vestcl.prepared import PreparedClip, find_prepared
+from vestcl.prepare.clip import prepare_clip
+from vestcl.prepare.prepared import PreparedClip, find_prepared
 
 
 def test_too_short_clips_say_how_many_frames_are_needed() -> None:

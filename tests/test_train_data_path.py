@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from test_train_data import FakeClip
 
 from train.data import Draw, WindowSet
-from vestcl.prepared import PreparedClip
+from vestcl.prepare.prepared import PreparedClip
 
 
 class Driven(FakeClip):

@@ -14,8 +14,8 @@ from train.data import WindowSet
 from train.degrade import Degradation
 from train.fit import window_set
 from vestcl.data.street import input as street_input
-from vestcl.prepare_clip import prepare_clip
-from vestcl.prepared import PreparedClip, find_prepared
+from vestcl.prepare.clip import prepare_clip
+from vestcl.prepare.prepared import PreparedClip, find_prepared
 
 HEIGHT, WIDTH, FRAMES = 48, 160, 5
 PLAIN = Degradation(False, (1.0, 1.0, 1.0), 0.0, 0.0, 0.0, None)

@@ -20,7 +20,7 @@ from vestcl.data import Street
 from vestcl.data.readers.splits import KITTI_VIEWS_TEST
 from vestcl.io import write_depth
 from vestcl.models.forecaster import Forecaster
-from vestcl.prepared import PreparedClip
+from vestcl.prepare.prepared import PreparedClip
 from vestcl.scene.inpainting.inpaint import DEFAULT
 from vestcl.scoring import GEOMETRIC
 

@@ -22,7 +22,7 @@ from vestcl.data.readers.splits import KITTI_VIEWS_TEST, KITTI_VIEWS_TRAIN
 from vestcl.models import ObjectMotion, config
 from vestcl.models.checkpoint import read_trained_on, write_checkpoint
 from vestcl.models.forecaster import Forecaster
-from vestcl.prepare_clip import prepare_clip
+from vestcl.prepare.clip import prepare_clip
 
 KILLED = -9
 

@@ -13,7 +13,7 @@ from train.ranks import Ranks
 from train.trainer import Trainer, build_model
 from vestcl.data import Street
 from vestcl.models.forecaster import Forecaster
-from vestcl.prepare_clip import prepare_clip
+from vestcl.prepare.clip import prepare_clip
 
 #: dB that are to be reached, and updates that may be spent, 0.09 s each on one core: 36.2 were measured after 700, from
 #: 26.8.

@@ -26,7 +26,7 @@ from vestcl.models import config
 from vestcl.models.config import EgoMotionConfig
 from vestcl.models.forecaster import Forecaster
 from vestcl.network_input import camera_path, last_motions, network_input
-from vestcl.prepared import Prepared, PreparedClip
+from vestcl.prepare.prepared import Prepared, PreparedClip
 from vestcl.scene.motion.camera_forecast import forecast_camera
 
 BOUNDED = dataclasses.replace(

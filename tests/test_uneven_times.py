@@ -25,8 +25,8 @@ from vestcl.io.images import to_pixels
 from vestcl.models.config import configuration
 from vestcl.models.inference import pretrained
 from vestcl.network_input import last_motions, network_input
-from vestcl.prepare_clip import EightBitPerception, frame_keys, prepare_clip
-from vestcl.prepared import PreparedClip, prepare_frame
+from vestcl.prepare.clip import EightBitPerception, frame_keys, prepare_clip
+from vestcl.prepare.prepared import PreparedClip, prepare_frame
 from vestcl.scene.motion.ego_motion import constant_velocity
 
 SOURCE = View("source", np.eye(4))

@@ -21,7 +21,7 @@ from train.config import Config, from_dict
 from train.report import Reporter
 from vestcl.data import Street
 from vestcl.models import config
-from vestcl.prepare_clip import prepare_clip
+from vestcl.prepare.clip import prepare_clip
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH = 48, 160

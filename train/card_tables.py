@@ -17,7 +17,7 @@ from train.evaluate_inputs import label_of, plain
 from train.fit import window_set
 from vestcl.data import Street
 from vestcl.models.config import ModelConfig
-from vestcl.prepared import PreparedClip
+from vestcl.prepare.prepared import PreparedClip
 from vestcl.scoring import GEOMETRIC, METRICS, Grid, horizon, number, to_markdown
 
 #: A procedural street's name in a clip.

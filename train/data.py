@@ -17,7 +17,7 @@ from train.config import DegradeConfig
 from vestcl.models.networks.layers import joined
 from vestcl.models.steps.prior import MotionPrior
 from vestcl.network_input import PAST, CameraPath, NetworkInput, camera_path, last_motions, network_input
-from vestcl.prepared import PreparedClip
+from vestcl.prepare.prepared import PreparedClip
 from vestcl.scene.layers import LayerBatch
 
 #: What random numbers are for, so that no two purposes share a stream: rng([seed, purpose, count]).

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from train.augment import LUMA, Matrix, Window
 from train.config import DegradeConfig
-from vestcl.prepared import Prepared
+from vestcl.prepare.prepared import Prepared
 
 Image = NDArray[np.float32]
 

@@ -10,8 +10,8 @@ from train.evaluate_options import Evaluation
 from train.evaluate_windows import PART_WINDOWS
 from train.protocols import Protocol
 from vestcl import __version__, st_lpips
+from vestcl.prepare.files import JSON
 from vestcl.prepare_command import identity
-from vestcl.prepared_files import JSON
 
 #: Settings that scores do not depend on, or that stand in the key as the content of files.
 _NOT_IN_KEY: Final = (

@@ -36,7 +36,7 @@ from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.weights_file import misfit
 from vestcl.opencl import session as runtime
-from vestcl.prepared import find_prepared
+from vestcl.prepare.prepared import find_prepared
 
 #: The exit status of a run that was told to stop (SIGTERM), as a shell has it.
 STOPPED: Final = 128 + signal.SIGTERM

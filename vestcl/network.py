@@ -20,7 +20,7 @@ from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
 from vestcl.models.inference.skipping import Count, Tally, count_skips
 from vestcl.models.inference.stage_times import watching, with_rest
 from vestcl.network_input import NetworkInput
-from vestcl.prepared import prepare_frame
+from vestcl.prepare.prepared import prepare_frame
 from vestcl.scene.inpainting.inpainters import Inpainter
 from vestcl.scene.perception import Perception
 

@@ -13,7 +13,7 @@ from vestcl import geometry
 from vestcl.models.networks.camera_correction import INTERVAL, MEASURED, rates_of
 from vestcl.models.networks.rigid_motion import RigidMotion
 from vestcl.models.steps.prior import MotionPrior
-from vestcl.prepared import Prepared
+from vestcl.prepare.prepared import Prepared
 from vestcl.scene import _check
 from vestcl.scene.layers import LayerBatch, batch
 from vestcl.scene.motion.camera_forecast import forecast_camera

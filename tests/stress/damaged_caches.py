@@ -19,8 +19,8 @@ import numpy as np
 
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
-from vestcl.prepare_clip import prepare_clip
-from vestcl.prepared import PreparedClip
+from vestcl.prepare.clip import prepare_clip
+from vestcl.prepare.prepared import PreparedClip
 
 TRIALS = 400
 HEIGHT, WIDTH, FRAMES = 24, 80, 4

@@ -12,7 +12,7 @@ from vestcl.geometric import Perception
 from vestcl.models.inference.effort import enlarged, fraction, reduced
 from vestcl.models.networks.layers import mapped
 from vestcl.network_input import NetworkInput, last_motions, network_input
-from vestcl.prepared import prepare_frame
+from vestcl.prepare.prepared import prepare_frame
 from vestcl.scene.layers import LayerBatch
 
 #: The current frame t: t - 2 and t - 1 before it tell how the camera's motion changes.

@@ -22,7 +22,7 @@ from vestcl.data import Street
 from vestcl.data.street.driving.drive import MAX_CHANGE, Sway
 from vestcl.models.steps.prior import nothing_moves
 from vestcl.network_input import NetworkInput, last_motions, network_input
-from vestcl.prepared import Prepared, prepare_frame
+from vestcl.prepare.prepared import Prepared, prepare_frame
 from vestcl.scene.layers import LayerBatch
 from vestcl.scene.perception import Perception
 

@@ -10,7 +10,7 @@ A frame's file holds, with n pixels where M = 0 and m pixels that move beside th
     mask, own, moving [ceil(HW / 8)] uint8, a bit a pixel  prev_from_cur [4, 4] float64
 
 right and prev_from_cur are left out where there is none. Its metadata hold the key of what it was computed
-from (vestcl/prepare_clip.py) and a CRC-32 of every tensor; names, types and shapes are checked against this table.
+from (vestcl/prepare/clip.py) and a CRC-32 of every tensor; names, types and shapes are checked against this table.
 clip.json holds a CRC-32 of its other entries, among them where depth, masks, camera motion and inpainting come from
 ("inputs"; files of former versions have none).
 """
@@ -32,7 +32,7 @@ from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.io.images import to_pixels
 
 if TYPE_CHECKING:
-    from vestcl.prepared import Prepared
+    from vestcl.prepare.prepared import Prepared
 
 #: Raised when perception, the procedural street or these files change: it makes every frame be computed anew.
 RECIPE: Final = "vestcl prepared 4"

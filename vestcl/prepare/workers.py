@@ -15,7 +15,7 @@ import cv2
 import torch
 
 from vestcl import interrupt
-from vestcl.prepare_clip import Outcome, Report
+from vestcl.prepare.clip import Outcome, Report
 
 #: Seconds between two looks at what other processes tell.
 _TICK: Final = 0.1

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vestcl.data import times
 from vestcl.data.inputs import Inputs
-from vestcl.prepared_files import ALWAYS, DAMAGE, JSON, damaged, frame_path, read_clip, read_tensors
+from vestcl.prepare.files import ALWAYS, DAMAGE, JSON, damaged, frame_path, read_clip, read_tensors
 from vestcl.scene.layers import Layers
 from vestcl.scene.perception import Perception
 

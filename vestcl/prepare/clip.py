@@ -21,8 +21,8 @@ from vestcl.data.sample import Clip, Sample
 from vestcl.io.atomic import read_bytes
 from vestcl.io.images import to_float, to_pixels
 from vestcl.io.video.reading import Video
-from vestcl.prepared import prepare_frame
-from vestcl.prepared_files import JSON, RECIPE, Shape, frame_path, restore_frame, write_clip, write_frame
+from vestcl.prepare.files import JSON, RECIPE, Shape, frame_path, restore_frame, write_clip, write_frame
+from vestcl.prepare.prepared import prepare_frame
 from vestcl.scene.inpainting.inpainters import Inpainter
 from vestcl.scene.perception import Perception
 
