@@ -10,7 +10,7 @@ import numpy as np
 from data_files import write_pictures, write_text
 
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, Rendered, View
+from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH, FRAMES = 24, 40, 6

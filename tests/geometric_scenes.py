@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vestcl.data import Street, intrinsics
 from vestcl.data.sample import Clip
-from vestcl.geometric.render import Cloud
+from vestcl.forecasting.geometric.render import Cloud
 from vestcl.scene.flow.correspondence import Correspondence
 
 Floats = NDArray[np.float32]

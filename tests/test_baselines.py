@@ -1,4 +1,4 @@
-"""vestcl.baselines by hand, and on textures whose motion is known."""
+"""vestcl.forecasting.baselines by hand, and on textures whose motion is known."""
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from vestcl import metrics
-from vestcl.baselines import backward_warp, flow_extrapolation, invert_flow, optical_flow, repeat_last
+from vestcl.forecasting.baselines import backward_warp, flow_extrapolation, invert_flow, optical_flow, repeat_last
 
 CLIP = Path(__file__).resolve().parents[2] / "shared" / "data" / "kitti_clip" / "image"
 

@@ -11,7 +11,7 @@ import torch
 from onnx_files import write_mix
 from st_lpips_weights import public_state
 
-from vestcl import cli, metrics, peer, perceptual
+from vestcl import cli, metrics, perceptual
 from vestcl.bench import _forecast_run as running
 from vestcl.bench import _forecast_tables as tables
 from vestcl.bench import _forecast_truth as known
@@ -23,7 +23,8 @@ from vestcl.compare import FLOW, REPEAT
 from vestcl.data import Street
 from vestcl.data.calibration import invert
 from vestcl.data.sample import Clip, Sample
-from vestcl.forecast import Forecast, Rendered, View
+from vestcl.forecasting import peer
+from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.io.labels import SKY
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.models.trunks import Trunk

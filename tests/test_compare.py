@@ -12,10 +12,10 @@ from vestcl.data.calibration import translation
 from vestcl.data.resize import resize_image
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageArray
-from vestcl.forecast import Forecast, Rendered, View
+from vestcl.forecasting.result import Forecast, Rendered, View
+from vestcl.forecasting.views import parse_views
 from vestcl.models.trunks import Trunk
 from vestcl.perceptual import squeeze_distance
-from vestcl.views import parse_views
 
 HEIGHT, WIDTH = 32, 48
 K = np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]])

@@ -9,10 +9,10 @@ from PIL import Image
 
 from vestcl import demo
 from vestcl.data import Street
+from vestcl.forecasting.views import parse_view
 from vestcl.models import configuration
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import pretrained
-from vestcl.views import parse_view
 
 
 @pytest.mark.parametrize("model", ["geometric", "vest-s"])

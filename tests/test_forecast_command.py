@@ -16,7 +16,7 @@ from stand_ins import put_module
 from vestcl import cli
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
-from vestcl.forecast_files import read_forecast
+from vestcl.forecasting.files import read_forecast
 from vestcl.io.video.reading import Video
 from vestcl.models.trunks import Trunk
 from vestcl.opencl import session as runtime
@@ -25,7 +25,7 @@ from vestcl.opencl import session as runtime
 @pytest.fixture
 def repeater(monkeypatch: pytest.MonkeyPatch) -> Repeater:
     repeater = Repeater("repeater")
-    put_module(monkeypatch, "vestcl.geometric", forecast_clip=repeater)
+    put_module(monkeypatch, "vestcl.forecasting.geometric", forecast_clip=repeater)
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.delenv("VESTCL_DEVICE", raising=False)
     return repeater

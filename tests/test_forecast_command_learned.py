@@ -8,7 +8,7 @@ from test_learned import model, stir_all
 from vestcl import cli
 from vestcl.compare import Comparison
 from vestcl.forecast_command import where_another_is_better
-from vestcl.forecast_files import read_forecast
+from vestcl.forecasting.files import read_forecast
 
 
 @pytest.fixture(scope="module")

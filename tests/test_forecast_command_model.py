@@ -14,7 +14,7 @@ from stand_ins import put_module
 from vestcl import cli
 from vestcl.compare import ORACLE
 from vestcl.data.sample import Clip
-from vestcl.forecast_files import read_forecast
+from vestcl.forecasting.files import read_forecast
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import pretrained
 
@@ -23,7 +23,7 @@ from vestcl.models.inference import pretrained
 def network(monkeypatch: pytest.MonkeyPatch) -> Repeater:
     """In place of the network, which foresees one frame."""
     network = Repeater("tiny", shift=1)
-    put_module(monkeypatch, "vestcl.network", forecast_clip=network)
+    put_module(monkeypatch, "vestcl.forecasting.network.forecast", forecast_clip=network)
     monkeypatch.setenv("COLUMNS", "200")
     return network
 
@@ -31,7 +31,7 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Repeater:
 @pytest.fixture
 def geometric(monkeypatch: pytest.MonkeyPatch) -> Repeater:
     geometric = Repeater("geometric")
-    put_module(monkeypatch, "vestcl.geometric", forecast_clip=geometric)
+    put_module(monkeypatch, "vestcl.forecasting.geometric", forecast_clip=geometric)
     return geometric
 
 

@@ -12,12 +12,12 @@ from vestcl import __version__
 from vestcl.data.calibration import translation
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageArray
-from vestcl.forecast import Forecast, Rendered, Skipped, View
-from vestcl.forecast_files import Details, machine, read_forecast, write_forecast
+from vestcl.forecasting.files import Details, machine, read_forecast, write_forecast
+from vestcl.forecasting.result import Forecast, Rendered, Skipped, View
+from vestcl.forecasting.views import parse_views
 from vestcl.io.images import to_float
 from vestcl.io.video.reading import Video
 from vestcl.opencl import session as runtime
-from vestcl.views import parse_views
 
 HEIGHT, WIDTH = 24, 40
 K = np.array([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""vestcl.geometric.forecast: a street's next frames, against what it really shows."""
+"""vestcl.forecasting.geometric.forecast: a street's next frames, against what it really shows."""
 
 import functools
 from dataclasses import dataclass, replace
@@ -11,10 +11,10 @@ from geometric_scenes import HEIGHT, WIDTH, Matrix, decibels, drive, move, point
 
 from vestcl.data import intrinsics
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, View
-from vestcl.geometric.forecast import METHOD, _clouds, forecast_clip, forecast_frames, show_frame
-from vestcl.geometric.paths import point_paths
-from vestcl.geometric.render import holes, show
+from vestcl.forecasting.geometric.forecast import METHOD, _clouds, forecast_clip, forecast_frames, show_frame
+from vestcl.forecasting.geometric.paths import point_paths
+from vestcl.forecasting.geometric.render import holes, show
+from vestcl.forecasting.result import Forecast, View
 from vestcl.scene.flow.correspondence import correspond
 from vestcl.scene.motion.camera_forecast import forecast_camera
 from vestcl.scene.perception import Perception

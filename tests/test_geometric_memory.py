@@ -1,4 +1,4 @@
-"""vestcl.geometric.memory: what earlier frames saw is bounded, and shown only where t and t-1 see nothing."""
+"""vestcl.forecasting.geometric.memory: what earlier frames saw is bounded, and shown only where t and t-1 see nothing."""
 
 import functools
 from collections.abc import Callable
@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from geometric_scenes import HEIGHT, WIDTH, Floats, K, Matrix, decibels, drive, noise, turned
 
-from vestcl.forecast import Forecast, View
-from vestcl.geometric import memory
-from vestcl.geometric.forecast import _static, forecast_frames
-from vestcl.geometric.memory import Memory, remember
-from vestcl.geometric.render import HOLE, Shown, holes, show
+from vestcl.forecasting.geometric import memory
+from vestcl.forecasting.geometric.forecast import _static, forecast_frames
+from vestcl.forecasting.geometric.memory import Memory, remember
+from vestcl.forecasting.geometric.render import HOLE, Shown, holes, show
+from vestcl.forecasting.result import Forecast, View
 from vestcl.scene.perception import Perception, Surface
 
 NOW, DISTANCE = 6, 20.0

@@ -17,8 +17,8 @@ from geometric_scenes import HEIGHT, WIDTH, drive
 from vestcl.constants import SKY_DEPTH
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DepthArray, DepthFile, ImageArray
-from vestcl.forecast import View
-from vestcl.geometric.forecast import forecast_frames, input_notes
+from vestcl.forecasting.geometric.forecast import forecast_frames, input_notes
+from vestcl.forecasting.result import View
 from vestcl.scene.perception import Perception
 
 #: A frame with another on either side.

@@ -1,4 +1,4 @@
-"""vestcl.geometric.render: planes on new views, by hand."""
+"""vestcl.forecasting.geometric.render: planes on new views, by hand."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ import torch
 from data_files import pose
 from geometric_scenes import HEIGHT, WIDTH, Floats, K, Matrix, cloud_of, decibels, flat, noise, planes, room
 
-from vestcl.baselines import backward_warp
-from vestcl.geometric.render import Cloud, Shown, holes, rendered, show
+from vestcl.forecasting.baselines import backward_warp
+from vestcl.forecasting.geometric.render import Cloud, Shown, holes, rendered, show
 
 EYE = np.eye(4)
 RED, GREEN, BLUE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

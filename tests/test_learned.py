@@ -1,4 +1,4 @@
-"""vestcl.learned and its backtest: a network corrects the geometric forecast by what would have improved it before."""
+"""vestcl.forecasting.network.learned and its backtest: a network corrects the geometric forecast by what would have improved it before."""
 
 import dataclasses
 import functools
@@ -12,14 +12,16 @@ import torch
 from forecaster_scenes import SMALL, change, stir
 from torch import nn
 
-from vestcl import geometric, learned_backtest, network
 from vestcl.data import Street
 from vestcl.data.sample import Clip
-from vestcl.forecast import LearnedPart, View
-from vestcl.geometric import Perception, render
-from vestcl.geometric.paths import forecast_cameras, point_paths
-from vestcl.learned import CorrectedPaths, corrections, forecast_path, given_input
-from vestcl.learned_backtest import choose_parts
+from vestcl.forecasting import geometric
+from vestcl.forecasting.geometric import Perception, render
+from vestcl.forecasting.geometric.paths import forecast_cameras, point_paths
+from vestcl.forecasting.network import backtest as learned_backtest
+from vestcl.forecasting.network import forecast as network
+from vestcl.forecasting.network.backtest import choose_parts
+from vestcl.forecasting.network.learned import CorrectedPaths, corrections, forecast_path, given_input
+from vestcl.forecasting.result import LearnedPart, View
 from vestcl.models.config import MOST_CHANGE, EgoMotionConfig
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import pretrained
@@ -124,7 +126,7 @@ def test_a_camera_that_is_better_is_used(monkeypatch: pytest.MonkeyPatch) -> Non
     wrong = np.eye(4)
     angle = 0.9 * 0.25 * 0.1
     wrong[:3, :3] = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
-    from vestcl import learned
+    from vestcl.forecasting.network import learned
 
     original = learned.camera_path
 
@@ -271,7 +273,7 @@ def test_a_refinement_of_forecasts_that_is_better_is_added(monkeypatch: pytest.M
         return dataclasses.replace(found, image=(found.image - np.float32(0.05)).clip(0, 1))
 
     plain = geometric.forecast_frames(perception(), 4, 2, VIEWS)
-    monkeypatch.setattr("vestcl.geometric.forecast.rendered", dark)
+    monkeypatch.setattr("vestcl.forecasting.geometric.forecast.rendered", dark)
     forecast = network.forecast_frames(perception(), forecast_refinement(0.05), 4, 2, VIEWS)
     assert forecast.learned["refinement"].used and forecast.learned["refinement"].why.count("dB at frame") == 2
     for frame, wanted in zip(forecast.frames, plain.frames, strict=True):

@@ -1,4 +1,4 @@
-"""vestcl.network: forecasts by a network, asked for and answered as the geometric ones are."""
+"""vestcl.forecasting.network.forecast: forecasts by a network, asked for and answered as the geometric ones are."""
 
 import dataclasses
 import functools
@@ -12,13 +12,13 @@ from forecaster_scenes import SMALL, TINY, stir
 
 from vestcl.data import Street
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, Skipped, View
-from vestcl.geometric import Perception
+from vestcl.forecasting.geometric import Perception
+from vestcl.forecasting.network.forecast import forecast_clip, forecast_frames, show_frame, what_was_skipped
+from vestcl.forecasting.network.input import last_motions, network_input
+from vestcl.forecasting.result import Forecast, Skipped, View
 from vestcl.models.forecaster import Forecaster, perceive_estimated
 from vestcl.models.inference.skipping import Count, Tally
 from vestcl.models.inference.stage_times import REST, STAGES
-from vestcl.network import forecast_clip, forecast_frames, show_frame, what_was_skipped
-from vestcl.network_input import last_motions, network_input
 from vestcl.prepare.prepared import prepare_frame
 
 HEIGHT, WIDTH = 48, 160

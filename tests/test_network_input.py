@@ -1,4 +1,4 @@
-"""vestcl.network_input: two prepared frames as the networks take them."""
+"""vestcl.forecasting.network.input: two prepared frames as the networks take them."""
 
 import dataclasses
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from vestcl import geometry
 from vestcl.data import Street
-from vestcl.geometric import Perception
+from vestcl.forecasting.geometric import Perception
+from vestcl.forecasting.network.input import as_motion, last_motions, network_input
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.ego_motion import RigidMotion
-from vestcl.network_input import as_motion, last_motions, network_input
 from vestcl.prepare.prepared import Prepared, prepare_frame
 from vestcl.scene.layers import Layers
 from vestcl.scene.motion.ego_motion import constant_velocity

@@ -1,4 +1,4 @@
-"""vestcl.peer: images forecast recursively, and shown from other cameras by their geometry."""
+"""vestcl.forecasting.peer: images forecast recursively, and shown from other cameras by their geometry."""
 
 import dataclasses
 from collections.abc import Callable
@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from vestcl import metrics, peer
+from vestcl import metrics
 from vestcl.data import Street
 from vestcl.data.sample import Clip
-from vestcl.forecast import View
-from vestcl.geometric import Perception, forecast_frames
+from vestcl.forecasting import peer
+from vestcl.forecasting.geometric import Perception, forecast_frames
+from vestcl.forecasting.result import View
+from vestcl.forecasting.views import parse_views
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.views import parse_views
 
 SIZE = 48, 160
 SOURCE_VIEW = View("source", np.eye(4))

@@ -8,13 +8,13 @@ import pytest
 from vestcl.data import Street
 from vestcl.data.inputs import Inputs
 from vestcl.data.sample import Clip
-from vestcl.geometric import forecast_frames
+from vestcl.forecasting.geometric import forecast_frames
+from vestcl.forecasting.peer import forecast_frames as peer_frames
+from vestcl.forecasting.views import parse_views
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.peer import forecast_frames as peer_frames
 from vestcl.prepare.clip import EightBitPerception, prepare_clip
 from vestcl.prepare.perception import PreparedPerception, PreparedSequence, as_clip
 from vestcl.prepare.prepared import PreparedClip
-from vestcl.views import parse_views
 
 SIZE = 48, 160
 

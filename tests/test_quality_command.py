@@ -8,7 +8,7 @@ from forecaster_scenes import SMALL
 from stand_ins import put_module
 
 from vestcl import cli
-from vestcl.forecast_files import read_forecast
+from vestcl.forecasting.files import read_forecast
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import quality
 from vestcl.models.inference.quality import LEVELS, Quality
@@ -18,7 +18,7 @@ from vestcl.models.inference.quality import LEVELS, Quality
 def network(monkeypatch: pytest.MonkeyPatch) -> Repeater:
     """In place of the network's forecast."""
     network = Repeater("small", shift=1)
-    put_module(monkeypatch, "vestcl.network", forecast_clip=network)
+    put_module(monkeypatch, "vestcl.forecasting.network.forecast", forecast_clip=network)
     return network
 
 

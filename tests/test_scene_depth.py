@@ -10,7 +10,7 @@ from data_files import pose, real
 
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip, RightCamera, Sample
-from vestcl.geometric import Perception
+from vestcl.forecasting.geometric import Perception
 from vestcl.scene.depth import combine_depth, depth_scores
 from vestcl.scene.depth.from_motion import motion_depth
 from vestcl.scene.depth.scores import DepthScores

@@ -9,12 +9,12 @@ import torch
 from corridor_scenes import HEIGHT, WIDTH, K, ahead, drive, off
 from data_files import pose, real
 
-from vestcl import baselines
 from vestcl.constants import SKY_DEPTH
 from vestcl.data import Street
 from vestcl.data.readers.kitti_odometry import open_kitti_odometry
 from vestcl.data.readers.video import open_video
 from vestcl.data.sample import Clip, Sample
+from vestcl.forecasting import baselines
 from vestcl.io.labels import SKY
 from vestcl.scene import perception
 from vestcl.scene.depth.from_motion import CAMERA_HEIGHT, MotionDepth, motion_depth

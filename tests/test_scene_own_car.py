@@ -6,7 +6,7 @@ import pytest
 from data_files import real
 
 from vestcl.data.open import open_sequence
-from vestcl.geometric import Perception
+from vestcl.forecasting.geometric import Perception
 from vestcl.scene.own_car import PAIRS, own_car
 
 HEIGHT, WIDTH = 180, 320

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from vestcl.data.open import open_sequence
 from vestcl.data.street.street import Street, intrinsics
-from vestcl.geometric import Perception
+from vestcl.forecasting.geometric import Perception
 from vestcl.io import read_image
 from vestcl.io.depth import read_depth
 from vestcl.io.labels import SKY, read_train_ids

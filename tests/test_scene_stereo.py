@@ -9,8 +9,8 @@ import torch
 from data_files import real
 from numpy.typing import NDArray
 
-from vestcl.baselines import backward_warp
 from vestcl.data.open import open_sequence
+from vestcl.forecasting.baselines import backward_warp
 from vestcl.scene.depth.stereo import stereo_depth
 
 HEIGHT, WIDTH, FOCAL, BASELINE = 96, 256, 200.0, 0.5

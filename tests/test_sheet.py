@@ -8,7 +8,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from vestcl.forecast import Rendered
+from vestcl.forecasting.result import Rendered
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.contact_sheet import Cell
 

@@ -14,13 +14,13 @@ from forecaster_scenes import SMALL, camera, frame, measured, stir
 
 from vestcl.data import Street
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, View
-from vestcl.geometric import Perception
+from vestcl.forecasting.geometric import Perception
+from vestcl.forecasting.network.forecast import forecast_clip, forecast_frames
+from vestcl.forecasting.result import Forecast, View
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.fast import accelerate
 from vestcl.models.inference.skipping import Count, count_skips, current_tally
 from vestcl.models.inference.stage_times import REST, STAGES, watching, with_rest
-from vestcl.network import forecast_clip, forecast_frames
 from vestcl.opencl import trace
 
 HEIGHT, WIDTH = 32, 64

@@ -14,9 +14,9 @@ from test_network_input import HEIGHT, MOTIONS, WIDTH, prepared
 from train import augment
 from train.augment import Window
 from vestcl import geometry, reference
+from vestcl.forecasting.network.input import last_motions, network_input
 from vestcl.models import EgoMotion, RigidMotion
 from vestcl.models.config import EgoMotionConfig
-from vestcl.network_input import last_motions, network_input
 from vestcl.scene.motion.ego_motion import constant_velocity
 
 #: A camera that stands to the right of the source, turned a little, with other intrinsics and a skew.

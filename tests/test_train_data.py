@@ -17,8 +17,8 @@ from torch.nn import functional
 from train.data import Batch, Draw, WindowSet, loader
 from vestcl import geometry
 from vestcl.data import Street
+from vestcl.forecasting.network.input import last_motions, network_input
 from vestcl.models.forecaster import Forecaster
-from vestcl.network_input import last_motions, network_input
 from vestcl.ops.unproject import unproject
 from vestcl.prepare.clip import prepare_clip
 from vestcl.prepare.prepared import Prepared, PreparedClip, find_prepared

@@ -18,7 +18,6 @@ from train.evaluate_inputs import PAIR
 from train.evaluate_leaks import training_overlap
 from train.evaluate_windows import AS_SEEN, CAMERA, CONSTANT_VELOCITY, PART_WINDOWS
 from train.protocols import NOW, Source
-from vestcl import peer
 from vestcl.compare import FLOW, REPEAT
 from vestcl.data import Street
 from vestcl.data.readers.splits import (
@@ -27,6 +26,7 @@ from vestcl.data.readers.splits import (
     KITTI_VIEWS_TEST,
     KITTI_VIEWS_TRAIN,
 )
+from vestcl.forecasting import peer
 from vestcl.io import read_pixels
 from vestcl.models.checkpoint import write_checkpoint
 from vestcl.models.forecaster import Forecaster

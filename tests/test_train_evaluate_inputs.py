@@ -27,12 +27,12 @@ from vestcl.data import Street
 from vestcl.data.inputs import Inputs
 from vestcl.data.sample import Clip, RightCamera
 from vestcl.data.sources import DisparityFile, ImageArray
-from vestcl.forecast import View
 from vestcl.forecast_command import Estimators
+from vestcl.forecasting.result import View
+from vestcl.forecasting.views import parse_view
 from vestcl.models.forecaster import Forecaster
 from vestcl.scoring import GEOMETRIC, SOURCE, Truth
 from vestcl.scoring.border import blacken_border
-from vestcl.views import parse_view
 
 SIZE = 48, 160
 

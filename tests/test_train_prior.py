@@ -22,10 +22,10 @@ from train.ranks import Ranks
 from train.trainer import Trainer, build_model
 from vestcl import geometry
 from vestcl.data.inputs import Inputs
+from vestcl.forecasting.network.input import camera_path, last_motions, network_input
 from vestcl.models import config
 from vestcl.models.config import EgoMotionConfig
 from vestcl.models.forecaster import Forecaster
-from vestcl.network_input import camera_path, last_motions, network_input
 from vestcl.prepare.prepared import Prepared, PreparedClip
 from vestcl.scene.motion.camera_forecast import forecast_camera
 

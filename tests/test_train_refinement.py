@@ -15,9 +15,9 @@ from train import forecasts, refinement, refinement_scores, trainer
 from train.forecasts import Entry, Window, pack, unpack
 from train.refinement import LOG, STATE, RefinementConfig, Samples, load_config, train, with_forecast_refinement
 from vestcl.data import Street
-from vestcl.forecast import View
-from vestcl.forecast_planes import forecast_planes
-from vestcl.geometric import Perception, forecast_frames
+from vestcl.forecasting.geometric import Perception, forecast_frames
+from vestcl.forecasting.network.planes import forecast_planes
+from vestcl.forecasting.result import View
 from vestcl.models.checkpoint import read_trained_on
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare_command import open_input

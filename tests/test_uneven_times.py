@@ -12,19 +12,21 @@ from test_network_input import MOTIONS, displaced, prepared
 from video_files import write_video
 
 from train.data import WindowSet
-from vestcl import baselines, cli, compare, network
+from vestcl import cli, compare
 from vestcl.bench import _forecast_run as running
 from vestcl.bench import forecast as bench
 from vestcl.data import Street
 from vestcl.data.calibration import power
 from vestcl.data.sample import Clip
-from vestcl.forecast import View
-from vestcl.forecast_files import read_forecast
-from vestcl.geometric import Perception, forecast_frames
+from vestcl.forecasting import baselines
+from vestcl.forecasting.files import read_forecast
+from vestcl.forecasting.geometric import Perception, forecast_frames
+from vestcl.forecasting.network import forecast as network
+from vestcl.forecasting.network.input import last_motions, network_input
+from vestcl.forecasting.result import View
 from vestcl.io.images import to_pixels
 from vestcl.models.config import configuration
 from vestcl.models.inference import pretrained
-from vestcl.network_input import last_motions, network_input
 from vestcl.prepare.clip import EightBitPerception, frame_keys, prepare_clip
 from vestcl.prepare.prepared import PreparedClip, prepare_frame
 from vestcl.scene.motion.ego_motion import constant_velocity

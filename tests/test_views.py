@@ -8,7 +8,7 @@ import pytest
 from vestcl.data.calibration import rigid, translation
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageArray
-from vestcl.views import parse_view, parse_views, seen_by
+from vestcl.forecasting.views import parse_view, parse_views, seen_by
 
 K = np.array([[40.0, 0, 33], [0, 50, 17], [0, 0, 1]])
 K_RIGHT = np.array([[41.0, 0, 30], [0, 51, 18], [0, 0, 1]])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vestcl import geometry
 from vestcl.data.resize import resize_image, resize_labels
-from vestcl.network_input import CameraPath
+from vestcl.forecasting.network.input import CameraPath
 from vestcl.prepare.prepared import Prepared
 from vestcl.scene.layers import Layers
 

@@ -14,9 +14,9 @@ from torch.utils.data import DataLoader, Dataset
 from train import augment, degrade
 from train.augment import Window
 from train.config import DegradeConfig
+from vestcl.forecasting.network.input import PAST, CameraPath, NetworkInput, camera_path, last_motions, network_input
 from vestcl.models.networks.layers import joined
 from vestcl.models.steps.prior import MotionPrior
-from vestcl.network_input import PAST, CameraPath, NetworkInput, camera_path, last_motions, network_input
 from vestcl.prepare.prepared import PreparedClip
 from vestcl.scene.layers import LayerBatch
 

@@ -33,10 +33,11 @@ from train.evaluate_sheets import write_sheets
 from train.evaluate_windows import Part, plan, read_inputs, read_part, run_part
 from train.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
-from vestcl import __version__, command_line, interrupt, options, peer
+from vestcl import __version__, command_line, interrupt, options
 from vestcl.bench import _results
 from vestcl.data.inputs import Inputs
 from vestcl.data.street import input as street_input
+from vestcl.forecasting import peer
 from vestcl.io.atomic import write_bytes
 from vestcl.metrics import MS_SSIM_SIDE
 from vestcl.models.forecaster import Forecaster

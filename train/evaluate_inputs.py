@@ -16,7 +16,7 @@ from train.protocols import Protocol
 from vestcl.data.inputs import Inputs, inputs_of, is_matched
 from vestcl.data.sample import Clip
 from vestcl.forecast_command import Estimators, load_estimators, with_estimates
-from vestcl.geometric import Perception
+from vestcl.forecasting.geometric import Perception
 from vestcl.prepare.perception import PreparedPerception, PreparedSequence
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 from vestcl.scoring import RIGHT

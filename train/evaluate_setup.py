@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from train.evaluate_inputs import Preprocessing
 from train.protocols import Protocol
 from vestcl.data.later_frames import LaterFrames, Perceived, later_frames
-from vestcl.learned import Learned
+from vestcl.forecasting.network.learned import Learned
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.models.trunks import Trunk
@@ -33,12 +33,12 @@ class Setup:
     lpips: Lpips | None = None
     st_lpips: StLpips | None = None
     peer: VoxelFlowNetwork | None = None
-    """The learned 2D baseline, `vestcl.peer`."""
+    """The learned 2D baseline, `vestcl.forecasting.peer`."""
     preprocessing: Preprocessing = field(default_factory=Preprocessing)
     perceive: Perceived | None = None
     """Where depth and mask of forecast frames come from, of models whose mode is "feedback"."""
     learned: Learned = "tested"
-    """Which learned parts count, see `vestcl.network.forecast_frames`."""
+    """Which learned parts count, see `vestcl.forecasting.network.forecast.forecast_frames`."""
 
     @property
     def modes(self) -> dict[str, Mode]:

@@ -18,14 +18,16 @@ from typing import Any, Final, TypeVar
 from train.evaluate_inputs import label_of, perceptions, plain
 from train.evaluate_setup import Setup
 from train.protocols import NOW, NOW_BORDER, Protocol, Source, currents
-from vestcl import network, peer
 from vestcl.data.inputs import Inputs
 from vestcl.data.later_frames import LaterFrames
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, Rendered, View
-from vestcl.geometric import Perception, show_frame
+from vestcl.forecasting import peer
+from vestcl.forecasting.geometric import Perception, show_frame
+from vestcl.forecasting.network import forecast as network
+from vestcl.forecasting.network.learned import Learned
+from vestcl.forecasting.result import Forecast, Rendered, View
+from vestcl.forecasting.views import parse_view, parse_views
 from vestcl.io.atomic import read_bytes, write_bytes
-from vestcl.learned import Learned
 from vestcl.models.forecaster import Forecaster
 from vestcl.scoring import (
     GEOMETRIC,
@@ -42,7 +44,6 @@ from vestcl.scoring import (
     true_motion,
 )
 from vestcl.scoring.methods import Method, forecasts_of
-from vestcl.views import parse_view, parse_views
 
 #: Windows of a part: a minute or so of work, which is what a killed run may lose, and few enough parts to list.
 PART_WINDOWS: Final = 32

@@ -25,9 +25,9 @@ from vestcl import cli, command_line, interrupt
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
 from vestcl.data.times import is_same
-from vestcl.forecast import View
-from vestcl.forecast_planes import forecast_planes
-from vestcl.geometric import Perception, forecast_frames
+from vestcl.forecasting.geometric import Perception, forecast_frames
+from vestcl.forecasting.network.planes import forecast_planes
+from vestcl.forecasting.result import View
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.config import FORECAST_PLANES
 from vestcl.prepare_command import open_input, plan, shard

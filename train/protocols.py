@@ -120,7 +120,7 @@ class Protocol:
     title: str
     sources: Callable[[Where], list[Source]]
     views: tuple[str, ...]
-    """Cameras of the future frames, as `vestcl.views.parse_view` reads them."""
+    """Cameras of the future frames, as `vestcl.forecasting.views.parse_view` reads them."""
     size: tuple[int, int] = (256, 832)
     """(height, width) px: clips are resized to it, anisotropically, before anything looks at them."""
     steps: int = FUTURE

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip, RightCamera
-from vestcl.forecast import Forecast, View
+from vestcl.forecasting.result import Forecast, View
+from vestcl.forecasting.views import seen_by
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.contact_sheet import Cell, Picture
 from vestcl.models.trunks import Trunk
 from vestcl.perceptual import StLpips
 from vestcl.scoring.pictures import FLOW, ORACLE, OTHER_CAMERA, REPEAT, Timed, Truth, predictions, score
-from vestcl.views import seen_by
 
 __all__ = [
     "FLOW",

@@ -18,19 +18,22 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from vestcl import baselines, forecast_files, geometric, metrics, network
+from vestcl import metrics
 from vestcl.compare import FORECAST
 from vestcl.data import Street
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, View
-from vestcl.geometric import Perception
-from vestcl.geometric.forecast import METHOD as GEOMETRIC
+from vestcl.forecasting import baselines, geometric
+from vestcl.forecasting import files as forecast_files
+from vestcl.forecasting.geometric import Perception
+from vestcl.forecasting.geometric.forecast import METHOD as GEOMETRIC
+from vestcl.forecasting.network import forecast as network
+from vestcl.forecasting.result import Forecast, View
+from vestcl.forecasting.views import parse_views
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.contact_sheet import Cell
 from vestcl.io.images import write_pixels
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import pretrained, quality
-from vestcl.views import parse_views
 
 #: Frames up to the current one, all that the forecast looks at, and the rate, frames a second.
 CONTEXT, FPS = 4, 10.0

@@ -15,13 +15,16 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from vestcl import compare, forecast_checks, forecast_files
+from vestcl import compare
 from vestcl.compare import Comparison
 from vestcl.data.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
-from vestcl.forecast import Forecast, Skipped, View
+from vestcl.forecasting import checks as forecast_checks
+from vestcl.forecasting import files as forecast_files
+from vestcl.forecasting.result import Forecast, Skipped, View
+from vestcl.forecasting.views import parse_views
 from vestcl.io import contact_sheet as sheet
 from vestcl.models.inference import pretrained, quality
 from vestcl.models.trunks import load_trunk
@@ -30,7 +33,6 @@ from vestcl.options import check_pixels
 from vestcl.perceptual import StLpips
 from vestcl.progress import Bar
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
-from vestcl.views import parse_views
 
 if TYPE_CHECKING:
     from vestcl import cli
@@ -264,11 +266,11 @@ def _forecast(
     asked = clip, index, options.steps, views
     how: dict[str, Any] = {} if inpaint is None else {"inpaint": inpaint}
     if model is None or later is None:
-        from vestcl import geometric
+        from vestcl.forecasting import geometric
 
         how |= {} if options.memory is None else {"memory": options.memory}
         return geometric.forecast_clip(*asked, progress=stages.show, **how)
-    from vestcl import network
+    from vestcl.forecasting.network import forecast as network
 
     how["mode"] = later.mode
     if options.learned is not None:

@@ -17,8 +17,8 @@ from vestcl import interrupt
 from vestcl.data.inputs import inputs_of
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
-from vestcl.forecast_checks import check_file_options, is_network_file
 from vestcl.forecast_command import open_clip
+from vestcl.forecasting.checks import check_file_options, is_network_file
 from vestcl.prepare.clip import Outcome, Report, prepare_clip
 from vestcl.prepare.workers import Task, Told, run_tasks
 from vestcl.progress import Bar

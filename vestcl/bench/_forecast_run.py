@@ -17,10 +17,11 @@ from vestcl.bench._forecast_truth import Facts
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
-from vestcl.forecast import View
-from vestcl.forecast_checks import check_input
 from vestcl.forecast_command import load_estimators, with_estimates
-from vestcl.geometric import Perception
+from vestcl.forecasting.checks import check_input
+from vestcl.forecasting.geometric import Perception
+from vestcl.forecasting.result import View
+from vestcl.forecasting.views import parse_views
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.models.trunks import Trunk
@@ -28,7 +29,6 @@ from vestcl.perceptual import StLpips
 from vestcl.progress import Bar
 from vestcl.scoring import SOURCE, Record, Truth
 from vestcl.scoring.regions import error_shares
-from vestcl.views import parse_views
 
 #: Streets of one input: their frames are made in memory.
 MOST_STREETS: Final = 1000
@@ -193,7 +193,7 @@ def run_clip(
         A window's records, and its facts.
 
     Raises:
-        ValueError: as `vestcl.geometric.forecast_frames`.
+        ValueError: as `vestcl.forecasting.geometric.forecast_frames`.
     """
     views = views_of(clip, config)
     perception = Perception(clip)

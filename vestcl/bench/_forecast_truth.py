@@ -15,8 +15,8 @@ from vestcl import metrics
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.street.clip import Shot, StreetImage
-from vestcl.forecast import Forecast
-from vestcl.geometric.render import Cloud, show
+from vestcl.forecasting.geometric.render import Cloud, show
+from vestcl.forecasting.result import Forecast
 from vestcl.io.labels import SKY, background
 from vestcl.scoring import ego_errors, true_motion
 

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl import network
-from vestcl.forecast import Forecast, View
-from vestcl.geometric import Perception
+from vestcl.forecasting.geometric import Perception
+from vestcl.forecasting.network import forecast as network
+from vestcl.forecasting.result import Forecast, View
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.scoring import GEOMETRIC, ORACLE, SOURCE, Prediction, Predictions, Record, Truth, look, score
@@ -52,7 +52,7 @@ def predict(
         steps: frames to forecast.
         views: cameras to judge from, each one of the rig's.
         future_from_cur: the true motion of the camera a step, [4, 4] m, for a forecast that is given it.
-        flow: the network of `vestcl.peer`, as a baseline.
+        flow: the network of `vestcl.forecasting.peer`, as a baseline.
         models: trained networks, by the name of their row.
 
     Returns:

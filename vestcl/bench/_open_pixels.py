@@ -12,12 +12,12 @@ from rich.table import Table
 
 from vestcl import metrics
 from vestcl.data.sample import Clip
-from vestcl.forecast import View
-from vestcl.geometric.forecast import forecast_frames
-from vestcl.geometric.render import HOLE
+from vestcl.forecasting.geometric.forecast import forecast_frames
+from vestcl.forecasting.geometric.render import HOLE
+from vestcl.forecasting.result import View
+from vestcl.forecasting.views import parse_views
 from vestcl.perceptual import StLpips
 from vestcl.scene.perception import Perception
-from vestcl.views import parse_views
 
 #: The steps that are scored.
 STEPS: Final = (1, 3, 5)

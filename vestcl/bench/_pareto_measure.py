@@ -17,10 +17,10 @@ from vestcl.bench._pareto_front import Point, spread
 from vestcl.bench._pareto_knobs import EXACT, Setting
 from vestcl.bench._pareto_scenes import Scene, double, full, shrunk
 from vestcl.bench._timing import Spread
+from vestcl.forecasting.network.input import NetworkInput
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.inference.skipping import NOTHING
 from vestcl.models.steps.memory import Memory
-from vestcl.network_input import NetworkInput
 
 Tell = Callable[[str], None]
 

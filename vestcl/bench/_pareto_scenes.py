@@ -8,10 +8,10 @@ from torch.nn import functional
 
 from vestcl import geometry
 from vestcl.data import Street
-from vestcl.geometric import Perception
+from vestcl.forecasting.geometric import Perception
+from vestcl.forecasting.network.input import NetworkInput, last_motions, network_input
 from vestcl.models.inference.effort import enlarged, fraction, reduced
 from vestcl.models.networks.layers import mapped
-from vestcl.network_input import NetworkInput, last_motions, network_input
 from vestcl.prepare.prepared import prepare_frame
 from vestcl.scene.layers import LayerBatch
 

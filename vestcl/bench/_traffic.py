@@ -20,8 +20,8 @@ import torch
 
 from vestcl.data import Street
 from vestcl.data.street.driving.drive import MAX_CHANGE, Sway
+from vestcl.forecasting.network.input import NetworkInput, last_motions, network_input
 from vestcl.models.steps.prior import nothing_moves
-from vestcl.network_input import NetworkInput, last_motions, network_input
 from vestcl.prepare.prepared import Prepared, prepare_frame
 from vestcl.scene.layers import LayerBatch
 from vestcl.scene.perception import Perception

@@ -16,7 +16,7 @@ from vestcl.data.later_frames import DepthOf
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.forecast_command import load_estimators
-from vestcl.geometric import Perception
+from vestcl.forecasting.geometric import Perception
 from vestcl.scene.depth import DepthScores, depth_scores
 from vestcl.scene.estimators import with_estimates
 

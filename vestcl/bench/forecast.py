@@ -10,11 +10,11 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from vestcl import peer
 from vestcl.bench import _forecast_tables as tables
 from vestcl.bench import _results
 from vestcl.bench._forecast_config import HELD_OUT, ForecastBench, check
 from vestcl.bench._forecast_run import Group, Networks, groups_of, kept_windows, run
+from vestcl.forecasting import peer
 from vestcl.io.atomic import write_bytes
 from vestcl.models.inference import quality
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork

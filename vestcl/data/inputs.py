@@ -65,7 +65,7 @@ class Inputs:
 def inputs_of(
     clip: Clip, *, depth_model: str | None = None, mask_model: str | None = None, inpaint: str | None = None
 ) -> Inputs:
-    """What `vestcl.geometric.Perception` takes for the frames of a clip.
+    """What `vestcl.forecasting.geometric.Perception` takes for the frames of a clip.
 
     Args:
         clip: as it is given to perception, with estimates in place.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from vestcl.forecast import Rendered
+from vestcl.forecasting.result import Rendered
 from vestcl.io.images import to_pixels
 
 Picture = NDArray[np.uint8]

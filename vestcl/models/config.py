@@ -55,7 +55,7 @@ LEAST_COVERAGE: Final = 0.1
 #: From this coverage on a side hides what is behind it: only cracks between a surface's points let it through.
 OPAQUE: Final = 0.5
 
-#: Planes that refinement of geometric forecasts is shown: `vestcl.forecast_planes`.
+#: Planes that refinement of geometric forecasts is shown: `vestcl.forecasting.network.planes`.
 FORECAST_PLANES: Final = 7
 
 #: The most that it changes a colour by, of 1, where a pixel is covered; where nothing covers it, by 1.
@@ -198,7 +198,7 @@ class RefineConfig:
     covers, filled from what surrounds it. "none" paints the image through a sigmoid."""
     refines: Literal["clouds", "forecast"] = "clouds"
     """"clouds": the splatted clouds, features among them. "forecast": planes of a geometric forecast
-    (`vestcl.forecast_planes`), whose image it adds to; the network's own forecast is then its base, unrefined."""
+    (`vestcl.forecasting.network.planes`), whose image it adds to; the network's own forecast is then its base, unrefined."""
 
     def __post_init__(self) -> None:
         if self.base not in ("none", "splatted", "filled"):

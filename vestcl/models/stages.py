@@ -261,7 +261,7 @@ class Stages(nn.Module):
         """What refinement adds to the image of a geometric forecast, [B, 3, H, W]; at `Effort.paint_scale` as `paint`.
 
         Args:
-            planes: [B, FORECAST_PLANES, H, W], of `vestcl.forecast_planes`.
+            planes: [B, FORECAST_PLANES, H, W], of `vestcl.forecasting.network.planes`.
         """
         height, width = planes.shape[2:]
         with self._autocast():

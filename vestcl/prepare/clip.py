@@ -89,7 +89,7 @@ def prepare_clip(
         perceived: the same frames as perception sees them; None is ``clip``. Without right cameras depth is not
             matched against the right images, which ``clip`` has as targets.
         estimators: a key of the networks that estimate depth or classes for the clip, or inpaint.
-        inpaint: how the background is filled, see `vestcl.geometric.Perception`.
+        inpaint: how the background is filled, see `vestcl.forecasting.geometric.Perception`.
         wait: for another process that is at this clip.
         report: called after each frame.
 

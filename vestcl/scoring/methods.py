@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl import peer
-from vestcl.forecast import Forecast, View
-from vestcl.geometric import Perception, forecast_frames
+from vestcl.forecasting import peer
+from vestcl.forecasting.geometric import Perception, forecast_frames
+from vestcl.forecasting.result import Forecast, View
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.scoring.pictures import GEOMETRIC, Timed
 
@@ -40,7 +40,7 @@ def forecasts_of(
         steps: frames to forecast.
         views: cameras.
         models: networks, by the name of their row.
-        flow: the network of `vestcl.peer`; None leaves that row out.
+        flow: the network of `vestcl.forecasting.peer`; None leaves that row out.
         future_from_cur: [4, 4] m a step, the true motion of the camera; None leaves that row out.
 
     Returns:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from vestcl import metrics
 from vestcl.data import calibration
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast
+from vestcl.forecasting.result import Forecast
 
 
 def true_motion(clip: Clip, index: int, steps: int) -> list[NDArray[np.float64]] | None:

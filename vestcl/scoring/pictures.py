@@ -10,14 +10,15 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from vestcl import baselines, metrics
+from vestcl import metrics
 from vestcl.data.resize import resize_image
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, View
+from vestcl.forecasting import baselines
+from vestcl.forecasting.result import Forecast, View
+from vestcl.forecasting.views import seen_by
 from vestcl.models.trunks import Trunk
 from vestcl.perceptual import Lpips, StLpips, _squared_difference
 from vestcl.scoring.border import blacken_border
-from vestcl.views import seen_by
 
 #: The forecast without weights, as tables and files call it.
 GEOMETRIC: Final = "geometric"

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from vestcl.data.resize import resize_labels
-from vestcl.forecast import Forecast, Rendered, View
+from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.scene.depth.road_plane import rays_of
 from vestcl.scoring.pictures import SEEN, Truth
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl import baselines
+from vestcl.forecasting import baselines
 from vestcl.scene import _check
 from vestcl.scene.exposure import matched_for_flow
 

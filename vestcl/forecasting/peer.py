@@ -15,9 +15,9 @@ from torch.nn import functional
 
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.times import is_same
-from vestcl.forecast import Forecast, Rendered, View
-from vestcl.geometric import Perception, show_frame
-from vestcl.geometric import forecast_frames as geometric_frames
+from vestcl.forecasting.geometric import Perception, show_frame
+from vestcl.forecasting.geometric import forecast_frames as geometric_frames
+from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.models.networks.voxel_flow import MULTIPLE, VoxelFlowNetwork
 
 #: The name of this method in tables and files.
@@ -68,7 +68,7 @@ def forecast_frames(
     """The frames after ``index``: from the source camera as the network forecasts them, from others by their geometry.
 
     To be seen from another camera, frame t+k gets the depth that the geometric forecast has at t+k; from there it is a
-    frame as any other (masks from motion, inpainted layers, points splatted: `vestcl.geometric.show_frame`).
+    frame as any other (masks from motion, inpainted layers, points splatted: `vestcl.forecasting.geometric.show_frame`).
 
     Args:
         perception: of the clip; other cameras need its depth and motion, the source camera only its images.

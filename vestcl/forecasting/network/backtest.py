@@ -22,10 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data.times import is_same
-from vestcl.forecast import LearnedPart, View
-from vestcl.geometric.forecast import forecast_frames as forecast_geometric
-from vestcl.geometric.paths import point_paths
-from vestcl.learned import (
+from vestcl.forecasting.geometric.forecast import forecast_frames as forecast_geometric
+from vestcl.forecasting.geometric.paths import point_paths
+from vestcl.forecasting.network.learned import (
     CAMERA,
     OBJECTS,
     PARTS,
@@ -41,6 +40,7 @@ from vestcl.learned import (
     given_motion,
     retouched,
 )
+from vestcl.forecasting.result import LearnedPart, View
 from vestcl.models.forecaster import Forecaster
 from vestcl.scene.depth.road_plane import rays_of
 from vestcl.scene.exposure import curve_by_flow

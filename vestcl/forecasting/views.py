@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, RightCamera, Sample
-from vestcl.forecast import View
+from vestcl.forecasting.result import View
 
 #: What stands after the three numbers: three angles, the field of view, the name.
 _ANGLES: Final = ("yaw", "pitch", "roll")

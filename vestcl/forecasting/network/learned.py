@@ -2,7 +2,7 @@
 
 A network's learned parts are the correction of the camera's motion (EMF), that of the objects' velocities (OMF), and
 what refinement adds to the image. Points, depth and colour are the geometric forecast's: without any part that is what
-comes out. `vestcl.learned_backtest` chooses the parts.
+comes out. `vestcl.forecasting.network.backtest` chooses the parts.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,13 +14,13 @@ import torch
 from numpy.typing import NDArray
 
 from vestcl import geometry
-from vestcl.forecast import LearnedPart, Rendered, View
-from vestcl.forecast_planes import forecast_planes
-from vestcl.geometric.paths import Paths
+from vestcl.forecasting.geometric.paths import Paths
+from vestcl.forecasting.network.input import PAST, CameraPath, NetworkInput, camera_path, last_motions, network_input
+from vestcl.forecasting.network.planes import forecast_planes
+from vestcl.forecasting.result import LearnedPart, Rendered, View
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.stage_times import watching
 from vestcl.models.steps.render import looks_of
-from vestcl.network_input import PAST, CameraPath, NetworkInput, camera_path, last_motions, network_input
 from vestcl.prepare.prepared import prepare_frame
 from vestcl.scene.perception import Perception
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, Rendered, View
-from vestcl.geometric.memory import MEMORY, Memory, remember
-from vestcl.geometric.paths import Paths, forecast_cameras, point_paths
-from vestcl.geometric.render import Cloud, Shown, holes, rendered, show
+from vestcl.forecasting.geometric.memory import MEMORY, Memory, remember
+from vestcl.forecasting.geometric.paths import Paths, forecast_cameras, point_paths
+from vestcl.forecasting.geometric.render import Cloud, Shown, holes, rendered, show
+from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.scene.exposure import as_exposed
 from vestcl.scene.inpainting.holes import deep_holes, fill_holes
 from vestcl.scene.inpainting.inpainters import Inpainter

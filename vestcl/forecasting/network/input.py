@@ -74,7 +74,7 @@ def network_input(
     Raises:
         ValueError: frames of different sizes or cameras, no motion, or a matrix that is not finite.
 
-    Source: SPEC section 8; `vestcl.geometric.forecast_frames` extrapolates alike.
+    Source: SPEC section 8; `vestcl.forecasting.geometric.forecast_frames` extrapolates alike.
     """
     if prev.layers.image.shape != cur.layers.image.shape:
         sizes = [f"{frame.layers.image.shape[1]}x{frame.layers.image.shape[2]}" for frame in (prev, cur)]
@@ -149,7 +149,7 @@ def last_motions(*frames: Prepared) -> list[NDArray[np.float64]]:
     """``cur_from_prev`` [4, 4] m of each frame that has a ``prev_from_cur``: all but a clip's first, oldest first.
 
     Args:
-        *frames: consecutive ones, oldest first; t - 1 and t give the two motions that `vestcl.geometric` takes.
+        *frames: consecutive ones, oldest first; t - 1 and t give the two motions that `vestcl.forecasting.geometric` takes.
 
     Returns:
         As many motions as frames, or one fewer.

@@ -1,4 +1,4 @@
-"""Forecasts by a trained network, asked for and answered as those of `vestcl.geometric` are."""
+"""Forecasts by a trained network, asked for and answered as those of `vestcl.forecasting.geometric` are."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -9,17 +9,17 @@ import torch
 from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
-from vestcl.forecast import Forecast, Rendered, Skipped, View
-from vestcl.geometric.forecast import forecast_frames as forecast_geometric
-from vestcl.geometric.forecast import input_notes
-from vestcl.geometric.paths import point_paths
-from vestcl.learned import REFINEMENT, CorrectedPaths, Learned, chosen_motion, given_input, refined
-from vestcl.learned_backtest import choose_parts
+from vestcl.forecasting.geometric.forecast import forecast_frames as forecast_geometric
+from vestcl.forecasting.geometric.forecast import input_notes
+from vestcl.forecasting.geometric.paths import point_paths
+from vestcl.forecasting.network.backtest import choose_parts
+from vestcl.forecasting.network.input import NetworkInput
+from vestcl.forecasting.network.learned import REFINEMENT, CorrectedPaths, Learned, chosen_motion, given_input, refined
+from vestcl.forecasting.result import Forecast, Rendered, Skipped, View
 from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
 from vestcl.models.inference.skipping import Count, Tally, count_skips
 from vestcl.models.inference.stage_times import watching, with_rest
-from vestcl.network_input import NetworkInput
 from vestcl.prepare.prepared import prepare_frame
 from vestcl.scene.inpainting.inpainters import Inpainter
 from vestcl.scene.perception import Perception
@@ -91,7 +91,7 @@ def forecast_frames(
 
     A network that starts from what was measured corrects the geometric forecast: its camera's motion, its objects'
     velocities, and its image. Each of these parts is used where it wins a test on frames up to t
-    (`vestcl.learned_backtest`); without any, the result is the geometric forecast. A network that starts from rest, and
+    (`vestcl.forecasting.network.backtest`); without any, the result is the geometric forecast. A network that starts from rest, and
     mode "feedback", have all parts and no test.
 
     Args:
@@ -221,7 +221,7 @@ def what_was_skipped(tally: Tally, profile: Mapping[str, float]) -> dict[str, Sk
 
 
 def show_frame(perception: Perception, model: Forecaster, index: int, views: Sequence[View]) -> dict[str, Rendered]:
-    """A frame itself as other cameras see it, at the same time; arguments and answer as `vestcl.geometric.show_frame`.
+    """A frame itself as other cameras see it, at the same time; arguments and answer as `vestcl.forecasting.geometric.show_frame`.
 
     Args:
         perception: of the clip.

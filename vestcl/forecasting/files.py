@@ -28,14 +28,14 @@ from numpy.typing import NDArray
 from vestcl import __version__
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
-from vestcl.forecast import Forecast, Rendered, View
+from vestcl.forecasting.result import Forecast, Rendered, View
+from vestcl.forecasting.views import check_name, seen_by
 from vestcl.io.atomic import read_bytes, remove_leftovers, write_bytes
 from vestcl.io.contact_sheet import Picture
 from vestcl.io.exr import ExrFrame, read_exr_frame, write_exr_frame
 from vestcl.io.images import read_image, to_pixels, write_image, write_pixels
 from vestcl.io.video.writing import encoder_note, write_gif, write_mp4
 from vestcl.opencl import session as runtime
-from vestcl.views import check_name, seen_by
 
 #: Raised when a reader of earlier files would misread newer ones.
 FORMAT: Final = "vestcl forecast 1"

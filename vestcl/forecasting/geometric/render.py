@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import vestcl
 from vestcl import constants
-from vestcl.forecast import Rendered
+from vestcl.forecasting.result import Rendered
 
 #: A point's radius in pixels of the source, and its limits in the target: for colour shown directly 0.9 to 1.0 is
 #: best (SPEC section 2); 1.2 loses 0.15 dB on KITTI at t+1.

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.forecast import Rendered
+from vestcl.forecasting.result import Rendered
 from vestcl.models.config import FORECAST_PLANES
 
 #: Seconds from frame to frame that a clip without timestamps counts as having.
