@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from vestcl.models.shift_tolerant import CHANNELS
+from vestcl.evaluation.trunks.shift_tolerant import CHANNELS
 
 #: Of the public file: layer -> the shape of its weight.
 CONVOLUTIONS = {

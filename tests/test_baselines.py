@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from vestcl import metrics
+from vestcl.evaluation import metrics
 from vestcl.forecasting.baselines import backward_warp, flow_extrapolation, invert_flow, optical_flow, repeat_last
 
 CLIP = Path(__file__).resolve().parents[2] / "shared" / "data" / "kitti_clip" / "image"

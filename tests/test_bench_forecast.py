@@ -11,7 +11,7 @@ import torch
 from onnx_files import write_mix
 from st_lpips_weights import public_state
 
-from vestcl import cli, metrics, perceptual
+from vestcl import cli
 from vestcl.bench import _forecast_run as running
 from vestcl.bench import _forecast_tables as tables
 from vestcl.bench import _forecast_truth as known
@@ -19,15 +19,16 @@ from vestcl.bench import _forecast_windows as windows
 from vestcl.bench import forecast as bench
 from vestcl.bench._forecast_windows import GEOMETRIC, ORACLE, SOURCE, TRUE_POSES, Prediction, Record, Truth
 from vestcl.bench.forecast import HELD_OUT, ForecastBench
-from vestcl.compare import FLOW, REPEAT
 from vestcl.data import Street
 from vestcl.data.calibration import invert
 from vestcl.data.sample import Clip, Sample
+from vestcl.evaluation import metrics, perceptual
+from vestcl.evaluation.compare import FLOW, REPEAT
+from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecasting import peer
 from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.io.labels import SKY
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.models.trunks import Trunk
 
 SIZE = 64, 208
 TINY: dict[str, Any] = {

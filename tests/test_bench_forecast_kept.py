@@ -15,9 +15,9 @@ from vestcl.bench._forecast_truth import Facts
 from vestcl.bench.forecast import ForecastBench
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
+from vestcl.evaluation import SOURCE, Record, Truth
+from vestcl.evaluation.regions import REGIONS, error_shares
 from vestcl.forecasting.result import Forecast, Rendered, View
-from vestcl.scoring import SOURCE, Record, Truth
-from vestcl.scoring.regions import REGIONS, error_shares
 
 SIZE = 64, 208
 TINY: dict[str, Any] = {

@@ -17,8 +17,8 @@ from vestcl import doctor
 from vestcl.bench import _plots, _report, _results
 from vestcl.bench._results import Measure, Results
 from vestcl.bench._timing import Spread
+from vestcl.evaluation.tables import Grid
 from vestcl.opencl import session as runtime
-from vestcl.scoring.tables import Grid
 
 
 def results(bench: str = "abacus", device: str = "0:0 frame", **details: Any) -> Results:

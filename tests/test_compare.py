@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from vestcl import metrics
-from vestcl.compare import FLOW, FORECAST, ORACLE, OTHER_CAMERA, REPEAT, compare, comparison_sheet
 from vestcl.data.calibration import translation
 from vestcl.data.resize import resize_image
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageArray
+from vestcl.evaluation import metrics
+from vestcl.evaluation.compare import FLOW, FORECAST, ORACLE, OTHER_CAMERA, REPEAT, compare, comparison_sheet
+from vestcl.evaluation.perceptual import squeeze_distance
+from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.forecasting.views import parse_views
-from vestcl.models.trunks import Trunk
-from vestcl.perceptual import squeeze_distance
 
 HEIGHT, WIDTH = 32, 48
 K = np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]])

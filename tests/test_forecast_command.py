@@ -16,9 +16,9 @@ from stand_ins import put_module
 from vestcl import cli
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
+from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecasting.files import read_forecast
 from vestcl.io.video.reading import Video
-from vestcl.models.trunks import Trunk
 from vestcl.opencl import session as runtime
 
 

@@ -6,7 +6,7 @@ import pytest
 from test_learned import model, stir_all
 
 from vestcl import cli
-from vestcl.compare import Comparison
+from vestcl.evaluation.compare import Comparison
 from vestcl.forecast_command import where_another_is_better
 from vestcl.forecasting.files import read_forecast
 

@@ -12,8 +12,8 @@ from forecaster_scenes import SMALL, TINY
 from stand_ins import put_module
 
 from vestcl import cli
-from vestcl.compare import ORACLE
 from vestcl.data.sample import Clip
+from vestcl.evaluation.compare import ORACLE
 from vestcl.forecasting.files import read_forecast
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import pretrained

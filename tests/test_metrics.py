@@ -1,4 +1,4 @@
-"""vestcl.metrics by hand, against scikit-image and against plain re-computations in NumPy."""
+"""vestcl.evaluation.metrics by hand, against scikit-image and against plain re-computations in NumPy."""
 
 import math
 from typing import Any
@@ -9,7 +9,8 @@ import torch
 from scipy import signal
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from vestcl import geometry, metrics
+from vestcl import geometry
+from vestcl.evaluation import metrics
 
 #: Where float32 rounding may show against float64 oracles.
 FLOAT32 = 2e-5

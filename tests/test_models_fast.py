@@ -12,7 +12,7 @@ import torch
 from forecaster_scenes import ABLATIONS, SMALL, TINY, camera, pair_of, stir, turning
 from torch.nn import functional
 
-from vestcl import metrics
+from vestcl.evaluation import metrics
 from vestcl.models import ModelConfig, ObjectMotion
 from vestcl.models.config import ObjectMotionConfig
 from vestcl.models.forecaster import Forecaster, Step

@@ -15,14 +15,14 @@ from torch import nn
 
 from train import checkpoint
 from vestcl import cli
+from vestcl.evaluation.perceptual import Lpips, VggLoss
+from vestcl.evaluation.trunks.trunks import Trunk, load_trunk
 from vestcl.models.checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import pretrained
 from vestcl.models.inference.fast import accelerate
 from vestcl.models.networks.encoder import Encoder, load_resnet34
-from vestcl.models.trunks import Trunk, load_trunk
 from vestcl.models.weights_file import read_state_dict, unwrapped
-from vestcl.perceptual import Lpips, VggLoss
 
 State = dict[str, torch.Tensor]
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from vestcl import metrics
 from vestcl.data import Street
 from vestcl.data.sample import Clip
+from vestcl.evaluation import metrics
 from vestcl.forecasting import peer
 from vestcl.forecasting.geometric import Perception, forecast_frames
 from vestcl.forecasting.result import View

@@ -1,4 +1,4 @@
-"""vestcl.perceptual against plain re-computations on random weights, and the real SqueezeNet where it is at hand."""
+"""vestcl.evaluation.perceptual against plain re-computations on random weights, and the real SqueezeNet where it is at hand."""
 
 from collections.abc import Callable
 from copy import deepcopy
@@ -10,8 +10,8 @@ import pytest
 import skimage.data
 import torch
 
-from vestcl.models.trunks import IMAGENET, Normalisation, Trunk, load_trunk
-from vestcl.perceptual import LPIPS_SCALING, Lpips, VggLoss, squeeze_distance
+from vestcl.evaluation.perceptual import LPIPS_SCALING, Lpips, VggLoss, squeeze_distance
+from vestcl.evaluation.trunks.trunks import IMAGENET, Normalisation, Trunk, load_trunk
 
 SQUEEZENET = Path(__file__).resolve().parents[2] / "shared" / "data" / "squeezenet" / "squeezenet_v1.0.npz"
 

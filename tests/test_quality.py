@@ -6,11 +6,11 @@ import pytest
 import torch
 from forecaster_scenes import PAINTING, SMALL, TINY
 
-from vestcl import metrics
 from vestcl.bench._pareto_knobs import Setting, describe
 from vestcl.bench._pareto_measure import step
 from vestcl.bench._pareto_scenes import Scene, scene
 from vestcl.bench._results import load
+from vestcl.evaluation import metrics
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import pretrained, quality
 from vestcl.models.inference.effort import Effort

@@ -1,10 +1,10 @@
-"""vestcl.scoring.statistics on numbers that can be worked out by hand."""
+"""vestcl.evaluation.statistics on numbers that can be worked out by hand."""
 
 import numpy as np
 import pytest
 
-from vestcl.scoring import Record
-from vestcl.scoring.statistics import Interval, bootstrap, differences, extremes, intervals, unit
+from vestcl.evaluation import Record
+from vestcl.evaluation.statistics import Interval, bootstrap, differences, extremes, intervals, unit
 
 
 def record(clip: str, index: int, method: str = "a", **scores: list[float]) -> Record:

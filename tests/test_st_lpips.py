@@ -14,11 +14,12 @@ from safetensors.torch import save_file
 from st_lpips_weights import public_state
 from torch.nn import functional
 
-from vestcl import cli, st_lpips
+from vestcl import cli
+from vestcl.evaluation import st_lpips
+from vestcl.evaluation.perceptual import StLpips
+from vestcl.evaluation.scores import distance
+from vestcl.evaluation.trunks.shift_tolerant import CHANNELS, SIDE, BlurPool, ShiftTolerantTrunk
 from vestcl.io import read_image
-from vestcl.models.shift_tolerant import CHANNELS, SIDE, BlurPool, ShiftTolerantTrunk
-from vestcl.perceptual import StLpips
-from vestcl.scoring.pictures import distance
 
 
 @pytest.fixture

@@ -21,10 +21,10 @@ from train.evaluate_windows import CAMERA, CONSTANT_VELOCITY
 from train.protocols import PROTOCOLS
 from train.report import LOG
 from vestcl.data import Street
+from vestcl.evaluation import GEOMETRIC, Record
 from vestcl.io.images import read_pixels, write_pixels
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare.files import JSON, RECIPE
-from vestcl.scoring import GEOMETRIC, Record
 
 FRAMES, STEP = 6, 0.8
 SETTINGS: dict[str, Any] = {

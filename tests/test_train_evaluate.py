@@ -18,7 +18,6 @@ from train.evaluate_inputs import PAIR
 from train.evaluate_leaks import training_overlap
 from train.evaluate_windows import AS_SEEN, CAMERA, CONSTANT_VELOCITY, PART_WINDOWS
 from train.protocols import NOW, Source
-from vestcl.compare import FLOW, REPEAT
 from vestcl.data import Street
 from vestcl.data.readers.splits import (
     KITTI_PREDICTION_TEST,
@@ -26,12 +25,13 @@ from vestcl.data.readers.splits import (
     KITTI_VIEWS_TEST,
     KITTI_VIEWS_TRAIN,
 )
+from vestcl.evaluation import GEOMETRIC, ORACLE, OTHER_CAMERA
+from vestcl.evaluation.compare import FLOW, REPEAT
 from vestcl.forecasting import peer
 from vestcl.io import read_pixels
 from vestcl.models.checkpoint import write_checkpoint
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.scoring import GEOMETRIC, ORACLE, OTHER_CAMERA
 
 STREETS: dict[str, Any] = {
     "protocol": "street", "height": SIZE[0], "width": SIZE[1], "steps": 2, "horizons": (1, 2), "samples": 1,

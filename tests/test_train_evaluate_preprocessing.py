@@ -18,11 +18,11 @@ from train.evaluate_options import Evaluation
 from vestcl import cli
 from vestcl.data import Street
 from vestcl.data.readers.splits import KITTI_VIEWS_TEST
+from vestcl.evaluation import GEOMETRIC
 from vestcl.io import write_depth
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare.prepared import PreparedClip
 from vestcl.scene.inpainting.inpaint import DEFAULT
-from vestcl.scoring import GEOMETRIC
 
 #: One window of one street, one step.
 ONE: dict[str, Any] = {

@@ -5,7 +5,7 @@ import dataclasses
 from train.evaluate_report import Results, as_json, grids, headline, markdown, short_grids, table_of_windows
 from train.evaluate_windows import CAMERA, CONSTANT_VELOCITY
 from train.protocols import NOW, PROTOCOLS, Protocol
-from vestcl.scoring import GEOMETRIC, Grid, Record
+from vestcl.evaluation import GEOMETRIC, Grid, Record
 
 NAME = PROTOCOLS["kitti-space"].title
 

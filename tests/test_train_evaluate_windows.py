@@ -13,9 +13,11 @@ from st_lpips_weights import public_state
 from train.evaluate_inputs import PAIR, known_of
 from train.evaluate_windows import CAMERA, Setup, forecast, perceptions_of, prepared, presenters, views_of, window
 from train.protocols import NOW, PROTOCOLS
-from vestcl import metrics
 from vestcl.data import Street
 from vestcl.data.sample import Clip
+from vestcl.evaluation import GEOMETRIC, SOURCE, Truth, metrics
+from vestcl.evaluation.perceptual import LPIPS_SCALING, Lpips, StLpips, squeeze_distance
+from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecasting import peer
 from vestcl.forecasting.geometric import Perception, forecast_frames
 from vestcl.forecasting.result import View
@@ -23,9 +25,6 @@ from vestcl.forecasting.views import parse_view
 from vestcl.models.config import configuration
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.models.trunks import Trunk
-from vestcl.perceptual import LPIPS_SCALING, Lpips, StLpips, squeeze_distance
-from vestcl.scoring import GEOMETRIC, SOURCE, Truth
 
 SIZE = 48, 160
 SOURCE_VIEW = View(SOURCE, np.eye(4))

@@ -13,13 +13,14 @@ from forecaster_scenes import OBJECTS, SMALL, TINY, camera, pair_of, stir, turni
 from train.config import LossConfig
 from train.data import Batch
 from train.losses import NEAREST, build_perceptual, path_errors, pose_errors, residual_motion, ssim_loss, total_loss
-from vestcl import geometry, metrics
+from vestcl import geometry
+from vestcl.evaluation import metrics
+from vestcl.evaluation.perceptual import VggLoss
+from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.models import EgoMotion, ObjectMotion, RigidMotion
 from vestcl.models.config import RoutingConfig
 from vestcl.models.forecaster import Forecaster, RenderedView, Step
 from vestcl.models.steps.prior import MotionPrior
-from vestcl.models.trunks import Trunk
-from vestcl.perceptual import VggLoss
 
 BATCH, HEIGHT, WIDTH = 2, 24, 32
 

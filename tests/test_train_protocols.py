@@ -12,8 +12,8 @@ from train.evaluate_windows import PART_WINDOWS, Part, plan
 from train.protocols import HELD_OUT, NOW, PROTOCOLS, Name, Where, currents
 from vestcl.bench.forecast import HELD_OUT as BENCH_HELD_OUT
 from vestcl.data.readers.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL, windows
+from vestcl.evaluation import METRICS
 from vestcl.io import write_pixels
-from vestcl.scoring import METRICS
 
 #: Frames of the synced test drives, as KITTI raw's release has them.
 TEST_FRAMES = {"0060": 78, "0084": 383, "0093": 433, "0096": 475}

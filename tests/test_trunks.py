@@ -1,4 +1,4 @@
-"""vestcl.models.trunks: shapes and names of the public networks, plain re-computations, files good and bad."""
+"""vestcl.evaluation.trunks.trunks: shapes and names of the public networks, plain re-computations, files good and bad."""
 
 import json
 import struct
@@ -12,8 +12,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models import trunks
-from vestcl.models.trunks import CAFFE, IMAGENET, Normalisation, Trunk, load_trunk
+from vestcl.evaluation.trunks import trunks
+from vestcl.evaluation.trunks.trunks import CAFFE, IMAGENET, Normalisation, Trunk, load_trunk
 
 SQUEEZENET = Path(__file__).resolve().parents[2] / "shared" / "data" / "squeezenet" / "squeezenet_v1.0.npz"
 

@@ -12,12 +12,13 @@ from test_network_input import MOTIONS, displaced, prepared
 from video_files import write_video
 
 from train.data import WindowSet
-from vestcl import cli, compare
+from vestcl import cli
 from vestcl.bench import _forecast_run as running
 from vestcl.bench import forecast as bench
 from vestcl.data import Street
 from vestcl.data.calibration import power
 from vestcl.data.sample import Clip
+from vestcl.evaluation import compare
 from vestcl.forecasting import baselines
 from vestcl.forecasting.files import read_forecast
 from vestcl.forecasting.geometric import Perception, forecast_frames

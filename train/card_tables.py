@@ -16,9 +16,9 @@ from train.config import Config, DataConfig, LossConfig
 from train.evaluate_inputs import label_of, plain
 from train.fit import window_set
 from vestcl.data import Street
+from vestcl.evaluation import GEOMETRIC, METRICS, Grid, horizon, number, to_markdown
 from vestcl.models.config import ModelConfig
 from vestcl.prepare.prepared import PreparedClip
-from vestcl.scoring import GEOMETRIC, METRICS, Grid, horizon, number, to_markdown
 
 #: A procedural street's name in a clip.
 _STREET: Final = re.compile(r"street (\d+)(?: .*)?")

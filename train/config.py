@@ -116,7 +116,7 @@ class PerceptualConfig:
 
     kind: Literal["none", "vgg19", "squeeze"] = "vgg19"
     weights: Path | None = None
-    """The classifier's file (`vestcl.models.trunks.load_trunk`)."""
+    """The classifier's file (`vestcl.evaluation.trunks.trunks.load_trunk`)."""
     weight: Weight = 1.0
 
     def __post_init__(self) -> None:

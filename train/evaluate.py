@@ -37,17 +37,17 @@ from vestcl import __version__, command_line, interrupt, options
 from vestcl.bench import _results
 from vestcl.data.inputs import Inputs
 from vestcl.data.street import input as street_input
+from vestcl.evaluation import GEOMETRIC, Record, to_rich
+from vestcl.evaluation.metrics import MS_SSIM_SIDE
+from vestcl.evaluation.perceptual import Lpips, StLpips
+from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.forecasting import peer
 from vestcl.io.atomic import write_bytes
-from vestcl.metrics import MS_SSIM_SIDE
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.models.trunks import load_trunk
 from vestcl.opencl import session as runtime
-from vestcl.perceptual import Lpips, StLpips
 from vestcl.prepare_command import shard
 from vestcl.progress import Bar
-from vestcl.scoring import GEOMETRIC, Record, to_rich
 
 #: Columns where tables don't go to a terminal.
 WIDTH: Final = 200

@@ -9,7 +9,8 @@ from typing import Any, Final
 from train.evaluate_options import Evaluation
 from train.evaluate_windows import PART_WINDOWS
 from train.protocols import Protocol
-from vestcl import __version__, st_lpips
+from vestcl import __version__
+from vestcl.evaluation import st_lpips
 from vestcl.prepare.files import JSON
 from vestcl.prepare_command import identity
 

@@ -8,9 +8,9 @@ import tyro
 
 from train.protocols import HELD_OUT, Name
 from vestcl.data.later_frames import Perceived
+from vestcl.evaluation.st_lpips import Option as StLpipsOption
 from vestcl.forecasting.network.learned import Learned
 from vestcl.models.forecaster import Mode
-from vestcl.st_lpips import Option as StLpipsOption
 
 
 @dataclass(frozen=True)

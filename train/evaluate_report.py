@@ -10,7 +10,7 @@ from train.evaluate_inputs import label_of, plain, sentences
 from train.evaluate_windows import CONSTANT_VELOCITY
 from train.protocols import PAPER_NOTE, Protocol
 from vestcl.data.inputs import Inputs
-from vestcl.scoring import (
+from vestcl.evaluation import (
     GEOMETRIC,
     METRICS,
     Grid,
@@ -26,7 +26,7 @@ from vestcl.scoring import (
     summarise,
     to_markdown,
 )
-from vestcl.scoring.statistics import Difference, Interval, cell, differences, drawn, interval_grid, intervals
+from vestcl.evaluation.statistics import Difference, Interval, cell, differences, drawn, interval_grid, intervals
 
 #: What models are held against: the forecast without weights and, for the camera's motion, where that takes it from.
 _BASELINES: Final = (GEOMETRIC, CONSTANT_VELOCITY)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from train.evaluate_inputs import Preprocessing
 from train.protocols import Protocol
 from vestcl.data.later_frames import LaterFrames, Perceived, later_frames
+from vestcl.evaluation.perceptual import Lpips, StLpips
+from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecasting.network.learned import Learned
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.models.trunks import Trunk
-from vestcl.perceptual import Lpips, StLpips
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,11 +10,11 @@ from train.evaluate_inputs import label_of, plain
 from train.evaluate_setup import Setup
 from train.evaluate_windows import forecast, perceptions_of, prepared, views_of
 from train.protocols import Source
+from vestcl.evaluation import GEOMETRIC, METRICS, Record, Truth
+from vestcl.evaluation.statistics import extremes
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.contact_sheet import Cell, Picture
 from vestcl.io.images import write_pixels
-from vestcl.scoring import GEOMETRIC, METRICS, Record, Truth
-from vestcl.scoring.statistics import extremes
 
 
 def write_sheets(

@@ -21,15 +21,7 @@ from train.protocols import NOW, NOW_BORDER, Protocol, Source, currents
 from vestcl.data.inputs import Inputs
 from vestcl.data.later_frames import LaterFrames
 from vestcl.data.sample import Clip
-from vestcl.forecasting import peer
-from vestcl.forecasting.geometric import Perception, show_frame
-from vestcl.forecasting.network import forecast as network
-from vestcl.forecasting.network.learned import Learned
-from vestcl.forecasting.result import Forecast, Rendered, View
-from vestcl.forecasting.views import parse_view, parse_views
-from vestcl.io.atomic import read_bytes, write_bytes
-from vestcl.models.forecaster import Forecaster
-from vestcl.scoring import (
+from vestcl.evaluation import (
     GEOMETRIC,
     OTHER_CAMERA,
     RIGHT,
@@ -43,7 +35,15 @@ from vestcl.scoring import (
     score,
     true_motion,
 )
-from vestcl.scoring.methods import Method, forecasts_of
+from vestcl.evaluation.methods import Method, forecasts_of
+from vestcl.forecasting import peer
+from vestcl.forecasting.geometric import Perception, show_frame
+from vestcl.forecasting.network import forecast as network
+from vestcl.forecasting.network.learned import Learned
+from vestcl.forecasting.result import Forecast, Rendered, View
+from vestcl.forecasting.views import parse_view, parse_views
+from vestcl.io.atomic import read_bytes, write_bytes
+from vestcl.models.forecaster import Forecaster
 
 #: Windows of a part: a minute or so of work, which is what a killed run may lose, and few enough parts to list.
 PART_WINDOWS: Final = 32

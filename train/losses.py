@@ -14,12 +14,12 @@ from torch.nn import functional
 
 from train.config import LossConfig
 from train.data import Batch
-from vestcl import metrics
+from vestcl.evaluation import metrics
+from vestcl.evaluation.perceptual import VggLoss, squeeze_distance
+from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.models import budget_loss
 from vestcl.models.forecaster import RenderedView, Step
 from vestcl.models.networks.layers import check
-from vestcl.models.trunks import load_trunk
-from vestcl.perceptual import VggLoss, squeeze_distance
 
 #: (prediction, target), [B, 3, H, W] each -> [B].
 Perceptual = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
@@ -33,8 +33,8 @@ def build_perceptual(config: LossConfig) -> Perceptual | None:
     """The perceptual distance that ``config`` names, its classifier frozen.
 
     Args:
-        config: the loss; ``perceptual.kind`` "vgg19" is `vestcl.perceptual.VggLoss`, "squeeze" is
-            `vestcl.perceptual.squeeze_distance`.
+        config: the loss; ``perceptual.kind`` "vgg19" is `vestcl.evaluation.perceptual.VggLoss`, "squeeze" is
+            `vestcl.evaluation.perceptual.squeeze_distance`.
 
     Returns:
         (prediction, target) -> [B], differentiable in both; None for kind "none" or weight 0.
@@ -108,7 +108,7 @@ def ssim_loss(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     factor is 0, as an untrained network's may be.
 
     Args:
-        prediction: [B, 3, H, W], RGB; H and W `vestcl.metrics.WINDOW` or more.
+        prediction: [B, 3, H, W], RGB; H and W `vestcl.evaluation.metrics.WINDOW` or more.
         target: [B, 3, H, W], RGB.
 
     Returns:

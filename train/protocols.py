@@ -28,9 +28,9 @@ from vestcl.data.readers.kitti_raw import open_kitti_raw
 from vestcl.data.readers.splits import CONTEXT, FUTURE, KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
+from vestcl.evaluation import RIGHT, SOURCE
 from vestcl.prepare.perception import as_clip
 from vestcl.prepare.prepared import PreparedClip, find_prepared
-from vestcl.scoring import RIGHT, SOURCE
 
 Name = Literal[
     "kitti-prediction", "kitti-space-time", "kitti-space", "kitti-space-val", "cityscapes-prediction", "street", "clip"

@@ -19,11 +19,12 @@ from rich.table import Table
 
 from train.command import ERRORS, failed
 from train.forecasts import Entry, unpack
-from vestcl import command_line, interrupt, metrics
+from vestcl import command_line, interrupt
+from vestcl.evaluation import metrics
+from vestcl.evaluation.perceptual import StLpips, squeeze_distance
+from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.pretrained import load_model
-from vestcl.models.trunks import load_trunk
-from vestcl.perceptual import StLpips, squeeze_distance
 
 #: (image, truth), [1, 3, H, W] each -> [1].
 Score = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]

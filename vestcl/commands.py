@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vestcl.st_lpips import Option as StLpipsOption
+from vestcl.evaluation.st_lpips import Option as StLpipsOption
 
 
 @dataclass(frozen=True)

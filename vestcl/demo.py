@@ -18,10 +18,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from vestcl import metrics
-from vestcl.compare import FORECAST
 from vestcl.data import Street
 from vestcl.data.sample import Clip
+from vestcl.evaluation import metrics
+from vestcl.evaluation.compare import FORECAST
 from vestcl.forecasting import baselines, geometric
 from vestcl.forecasting import files as forecast_files
 from vestcl.forecasting.geometric import Perception

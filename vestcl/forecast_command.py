@@ -15,22 +15,22 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from vestcl import compare
-from vestcl.compare import Comparison
 from vestcl.data.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
+from vestcl.evaluation import compare
+from vestcl.evaluation.compare import Comparison
+from vestcl.evaluation.perceptual import StLpips
+from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.forecasting import checks as forecast_checks
 from vestcl.forecasting import files as forecast_files
 from vestcl.forecasting.result import Forecast, Skipped, View
 from vestcl.forecasting.views import parse_views
 from vestcl.io import contact_sheet as sheet
 from vestcl.models.inference import pretrained, quality
-from vestcl.models.trunks import load_trunk
 from vestcl.opencl import session as runtime
 from vestcl.options import check_pixels
-from vestcl.perceptual import StLpips
 from vestcl.progress import Bar
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 

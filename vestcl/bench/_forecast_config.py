@@ -6,8 +6,8 @@ from typing import ClassVar, Final, Literal
 
 import tyro
 
+from vestcl.evaluation.st_lpips import Option as StLpipsOption
 from vestcl.models.inference.quality import Quality
-from vestcl.st_lpips import Option as StLpipsOption
 
 #: Streets that nothing is tuned, trained or tested on: what "street:" stands for.
 HELD_OUT: Final = range(1000, 1020)

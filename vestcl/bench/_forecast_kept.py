@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import vestcl
 from vestcl.bench._forecast_truth import Facts
-from vestcl.scoring import Record
+from vestcl.evaluation import Record
 
 Window = tuple[list[Record], list[Facts]]
 

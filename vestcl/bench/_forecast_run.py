@@ -17,6 +17,10 @@ from vestcl.bench._forecast_truth import Facts
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
+from vestcl.evaluation import SOURCE, Record, Truth
+from vestcl.evaluation.perceptual import StLpips
+from vestcl.evaluation.regions import error_shares
+from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecast_command import load_estimators, with_estimates
 from vestcl.forecasting.checks import check_input
 from vestcl.forecasting.geometric import Perception
@@ -24,11 +28,7 @@ from vestcl.forecasting.result import View
 from vestcl.forecasting.views import parse_views
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.models.trunks import Trunk
-from vestcl.perceptual import StLpips
 from vestcl.progress import Bar
-from vestcl.scoring import SOURCE, Record, Truth
-from vestcl.scoring.regions import error_shares
 
 #: Streets of one input: their frames are made in memory.
 MOST_STREETS: Final = 1000

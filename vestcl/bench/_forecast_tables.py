@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from vestcl.bench._forecast_truth import Facts
-from vestcl.scoring import (
+from vestcl.evaluation import (
     METRICS,
     Grid,
     Record,
@@ -20,8 +20,8 @@ from vestcl.scoring import (
     to_markdown,
     to_rich,
 )
-from vestcl.scoring.regions import REGIONS
-from vestcl.scoring.statistics import interval_grid
+from vestcl.evaluation.regions import REGIONS
+from vestcl.evaluation.statistics import interval_grid
 
 __all__ = [
     "Grid",

@@ -11,14 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vestcl import metrics
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.street.clip import Shot, StreetImage
+from vestcl.evaluation import ego_errors, metrics, true_motion
 from vestcl.forecasting.geometric.render import Cloud, show
 from vestcl.forecasting.result import Forecast
 from vestcl.io.labels import SKY, background
-from vestcl.scoring import ego_errors, true_motion
 
 __all__ = ["Facts", "ego_errors", "motion_errors", "shot", "splatter_alone", "step_truth", "true_motion"]
 

@@ -1,4 +1,4 @@
-"""One window of `vestcl bench forecast`: the methods that it compares. How they are scored is `vestcl.scoring`'s.
+"""One window of `vestcl bench forecast`: the methods that it compares. How they are scored is `vestcl.evaluation`'s.
 
 Pictures are made at the clip's own size.
 """
@@ -8,15 +8,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.evaluation import GEOMETRIC, ORACLE, SOURCE, Prediction, Predictions, Record, Truth, look, score
+from vestcl.evaluation import predictions as all_predictions
+from vestcl.evaluation.methods import TRUE_POSES, Method, forecasts_of
+from vestcl.evaluation.scores import distance as _distance
 from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.network import forecast as network
 from vestcl.forecasting.result import Forecast, View
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.scoring import GEOMETRIC, ORACLE, SOURCE, Prediction, Predictions, Record, Truth, look, score
-from vestcl.scoring import predictions as all_predictions
-from vestcl.scoring.methods import TRUE_POSES, Method, forecasts_of
-from vestcl.scoring.pictures import distance as _distance
 
 __all__ = [
     "GEOMETRIC",

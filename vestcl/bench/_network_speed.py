@@ -22,13 +22,13 @@ from torch import nn
 from vestcl.bench import _timing
 from vestcl.bench._results import Measure
 from vestcl.bench._timing import Spread
+from vestcl.evaluation.tables import Grid
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.fast import accelerate, computes_bfloat16, share_frames
 from vestcl.models.inference.skipping import NOTHING
 from vestcl.models.networks.object_motion import ObjectMotion, ObjectMotionForecast
 from vestcl.models.steps.prior import MotionPrior
 from vestcl.scene.layers import LayerBatch
-from vestcl.scoring.tables import Grid
 
 #: What all others of a group are compared with.
 PLAIN: Final = "plain"

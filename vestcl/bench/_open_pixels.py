@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
 
-from vestcl import metrics
 from vestcl.data.sample import Clip
+from vestcl.evaluation import metrics
+from vestcl.evaluation.perceptual import StLpips
 from vestcl.forecasting.geometric.forecast import forecast_frames
 from vestcl.forecasting.geometric.render import HOLE
 from vestcl.forecasting.result import View
 from vestcl.forecasting.views import parse_views
-from vestcl.perceptual import StLpips
 from vestcl.scene.perception import Perception
 
 #: The steps that are scored.

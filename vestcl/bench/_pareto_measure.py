@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vestcl import metrics
 from vestcl.bench import _timing
 from vestcl.bench._pareto_front import Point, spread
 from vestcl.bench._pareto_knobs import EXACT, Setting
 from vestcl.bench._pareto_scenes import Scene, double, full, shrunk
 from vestcl.bench._timing import Spread
+from vestcl.evaluation import metrics
 from vestcl.forecasting.network.input import NetworkInput
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.inference.skipping import NOTHING

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from vestcl.bench._results import Measure
-from vestcl.scoring.tables import Grid, number
+from vestcl.evaluation.tables import Grid, number
 
 _NOTES: Final = (
     "ms: a step, median and quartiles; t - 1 is remembered. x: the exact one's time over it.",

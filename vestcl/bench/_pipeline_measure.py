@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vestcl import metrics
 from vestcl.bench import _timing
 from vestcl.bench._splatter import counting
 from vestcl.bench._timing import Spread
 from vestcl.bench._traffic import EMPTY, JAM, TRAFFIC, Drive, Window
+from vestcl.evaluation import metrics
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.skipping import NOTHING, Count, Skip, count_skips
 from vestcl.models.inference.stage_times import watching, with_rest

@@ -21,9 +21,9 @@ from vestcl.bench._results import X_COPY, Measure
 from vestcl.bench._stacked import Bar
 from vestcl.bench._timing import Spread
 from vestcl.bench._traffic import EVERYTHING
+from vestcl.evaluation.tables import Grid
 from vestcl.models.inference.skipping import Count
 from vestcl.models.inference.stage_times import REST, STAGES
-from vestcl.scoring.tables import Grid
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from vestcl.bench._kernels import Profile
 from vestcl.bench._measure import Facts, Memory, Pass, Peers, Ratio, Speed, growth
 from vestcl.bench._results import X_COPY, Measure
 from vestcl.bench._timing import Spread, is_quiet
-from vestcl.scoring.tables import Grid
+from vestcl.evaluation.tables import Grid
 
 #: What a cell may end with, and its colour on the screen.
 _VERDICTS: Final = {"reached": "green", "missed": "red", "can't tell": "yellow", "better": "green", "worse": "red"}

@@ -19,9 +19,9 @@ from rich.text import Text
 
 from vestcl import __version__, doctor
 from vestcl.bench._timing import Spread
+from vestcl.evaluation.tables import Grid, finite, to_markdown, to_rich
 from vestcl.io import atomic
 from vestcl.opencl import session as runtime
-from vestcl.scoring.tables import Grid, finite, to_markdown, to_rich
 
 #: The selector that means every device that works.
 ALL: Final = "all"

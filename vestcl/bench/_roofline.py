@@ -12,8 +12,8 @@ from vestcl.bench import _plots, _report, _results
 from vestcl.bench._results import Measure, Results
 from vestcl.bench._roofs import Roofline, roofline
 from vestcl.bench._scenes import street
+from vestcl.evaluation.tables import Grid
 from vestcl.opencl import session as runtime
-from vestcl.scoring.tables import Grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,8 @@ from vestcl.bench._pipeline_report import ms
 from vestcl.bench._results import Measure
 from vestcl.bench._stacked import Bar
 from vestcl.bench._train_measure import ADAM, BACKWARD, EVERYTHING_LEARNS, FORWARD, OURS, TWIN, StepTimes, TwinTimes
+from vestcl.evaluation.tables import Grid
 from vestcl.models.inference.stage_times import REST, STAGES
-from vestcl.scoring.tables import Grid
 
 
 def grids(steps: Sequence[StepTimes], twin: TwinTimes | None, size: str, twin_size: str) -> list[Grid]:

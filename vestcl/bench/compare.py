@@ -15,8 +15,8 @@ from rich.text import Text
 
 from vestcl.bench import _report, _results
 from vestcl.bench._results import X_COPY, Measure, Results
+from vestcl.evaluation.tables import Grid, to_markdown
 from vestcl.io import atomic
-from vestcl.scoring.tables import Grid, to_markdown
 
 Verdict = Literal["better", "worse", "noise", "machine"]
 

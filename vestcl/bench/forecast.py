@@ -14,13 +14,13 @@ from vestcl.bench import _forecast_tables as tables
 from vestcl.bench import _results
 from vestcl.bench._forecast_config import HELD_OUT, ForecastBench, check
 from vestcl.bench._forecast_run import Group, Networks, groups_of, kept_windows, run
+from vestcl.evaluation.perceptual import StLpips
+from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.forecasting import peer
 from vestcl.io.atomic import write_bytes
 from vestcl.models.inference import quality
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.models.trunks import load_trunk
 from vestcl.opencl import session as runtime
-from vestcl.perceptual import StLpips
 
 __all__ = ["HELD_OUT", "ForecastBench", "main"]
 

@@ -21,12 +21,12 @@ from vestcl.constants import SKY_DEPTH
 from vestcl.data import Street, intrinsics
 from vestcl.data.open import open_sequence
 from vestcl.data.street.raycast import SKY_DEPTH as STREET_SKY
+from vestcl.evaluation.perceptual import StLpips
+from vestcl.evaluation.st_lpips import Option as StLpipsOption
 from vestcl.io.labels import background
 from vestcl.opencl import session as runtime
-from vestcl.perceptual import StLpips
 from vestcl.scene.inpainting.inpaint import DEFAULT, inpaint_background
 from vestcl.scene.inpainting.inpainters import METHODS
-from vestcl.st_lpips import Option as StLpipsOption
 
 #: Seeds of the streets, which nothing is trained on.
 FIRST_SEED: Final = 2000

@@ -18,13 +18,13 @@ from vestcl.bench._scenes import AHEAD
 from vestcl.bench._timing import Spread, Task
 from vestcl.bench.splat import CHANNELS
 from vestcl.data import Street, intrinsics
+from vestcl.evaluation.tables import Grid
 from vestcl.opencl import session as runtime
 from vestcl.opencl import trace
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.splat import splat
 from vestcl.ops.unproject import unproject
-from vestcl.scoring.tables import Grid
 
 Tensors = tuple[torch.Tensor, ...]
 

@@ -12,9 +12,9 @@ from rich.console import Console
 
 from vestcl.bench import _fragments, _kernels, _measure, _peers, _plots, _pytorch3d, _report, _results, _scenes, _timing
 from vestcl.bench._results import Measure, Results
+from vestcl.evaluation.tables import Grid
 from vestcl.opencl import session as runtime
 from vestcl.opencl import trace
-from vestcl.scoring.tables import Grid
 
 __all__ = ["SplatBench", "main"]
 

@@ -21,8 +21,8 @@ from vestcl.bench._stability_bounds import UNIT, Bounds, bounds_of
 from vestcl.bench._stability_cases import FAMILIES, Case, Family
 from vestcl.bench._stability_peers import LEFT_OUT, peers_of
 from vestcl.bench._stability_programs import OPERATORS, Operators, Outcome, evaluate, relative_error
+from vestcl.evaluation.tables import Grid, to_rich
 from vestcl.opencl import session as runtime
-from vestcl.scoring.tables import Grid, to_rich
 
 _NORM: Final = "Errors are max |float32 - float64| / max |float64| over each array; shown is the worst array's."
 

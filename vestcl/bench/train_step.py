@@ -16,11 +16,11 @@ from vestcl.bench._traffic import LEAST_FRAMES, TRAFFIC, drive
 from vestcl.bench._train_measure import Batch, StepTimes, TwinTimes, measure_steps, measure_twin, stacked
 from vestcl.bench.network import peak_gigabytes
 from vestcl.bench.pipeline import SEED
+from vestcl.evaluation.tables import Grid
 from vestcl.models import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster
 from vestcl.opencl import session as runtime
 from vestcl.opencl import trace
-from vestcl.scoring.tables import Grid
 
 #: Deviation of the last layers' weights of object motion, metres: as it is made it changes nothing, and would not run
 #: where it does not learn.

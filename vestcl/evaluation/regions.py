@@ -7,9 +7,9 @@ import torch
 from numpy.typing import NDArray
 
 from vestcl.data.resize import resize_labels
+from vestcl.evaluation.scores import SEEN, Truth
 from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.scene.depth.road_plane import rays_of
-from vestcl.scoring.pictures import SEEN, Truth
 
 #: The regions; a pixel belongs to the first that it fits.
 REGIONS: Final = ("holes", "sky", "objects", "near", "far")

@@ -12,8 +12,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from vestcl import metrics
-from vestcl.scoring.pictures import RIGHT, Record
+from vestcl.evaluation import metrics
+from vestcl.evaluation.scores import RIGHT, Record
 
 Means = dict[str, list[float]]
 """By metric, a number a step."""
@@ -69,7 +69,7 @@ def means(of_windows: Sequence[Means]) -> Means:
 
 
 def running_mean(by_horizon: Means) -> Means:
-    """`vestcl.metrics.running_mean` of each metric."""
+    """`vestcl.evaluation.metrics.running_mean` of each metric."""
     return {name: metrics.running_mean(torch.tensor(of)).tolist() for name, of in by_horizon.items()}
 
 

@@ -7,11 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.evaluation.scores import GEOMETRIC, Timed
 from vestcl.forecasting import peer
 from vestcl.forecasting.geometric import Perception, forecast_frames
 from vestcl.forecasting.result import Forecast, View
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.scoring.pictures import GEOMETRIC, Timed
 
 #: The geometric forecast with the camera's true motion.
 TRUE_POSES: Final = "geometric, true poses"

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vestcl import metrics
 from vestcl.data import calibration
 from vestcl.data.sample import Clip
+from vestcl.evaluation import metrics
 from vestcl.forecasting.result import Forecast
 
 
@@ -29,7 +29,7 @@ def true_motion(clip: Clip, index: int, steps: int) -> list[NDArray[np.float64]]
 
 
 def ego_errors(forecast: Forecast, truth: list[NDArray[np.float64]]) -> dict[str, list[float]]:
-    """`vestcl.metrics.ego_motion_error` of ``future_from_cur``, step by step.
+    """`vestcl.evaluation.metrics.ego_motion_error` of ``future_from_cur``, step by step.
 
     Args:
         forecast: with ``future_from_cur``.

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip, RightCamera
+from vestcl.evaluation.perceptual import StLpips
+from vestcl.evaluation.scores import FLOW, ORACLE, OTHER_CAMERA, REPEAT, Timed, Truth, predictions, score
+from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecasting.result import Forecast, View
 from vestcl.forecasting.views import seen_by
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.contact_sheet import Cell, Picture
-from vestcl.models.trunks import Trunk
-from vestcl.perceptual import StLpips
-from vestcl.scoring.pictures import FLOW, ORACLE, OTHER_CAMERA, REPEAT, Timed, Truth, predictions, score
 
 __all__ = [
     "FLOW",
@@ -79,16 +79,16 @@ def compare(
 ) -> list[Comparison]:
     """Score every view that a camera of the rig really saw, step by step as long as the clip has a frame at that time.
 
-    Baselines and scores are those of `vestcl.scoring`, as `vestcl bench forecast` and `train.evaluate` have them.
+    Baselines and scores are those of `vestcl.evaluation`, as `vestcl bench forecast` and `train.evaluate` have them.
 
     Args:
         forecast: frames at t+1, ... with every view.
         clip: with true frames after t.
         index: of the frame t in ``clip``, 1 or more.
         views: the cameras; those that nobody looked from are passed over.
-        trunk: SqueezeNet 1.0, for the squeeze distance (`vestcl.perceptual.squeeze_distance`).
+        trunk: SqueezeNet 1.0, for the squeeze distance (`vestcl.evaluation.perceptual.squeeze_distance`).
         report: is given the share of the steps that are done, 0 to 1.
-        st_lpips: for ST-LPIPS (`vestcl.perceptual.StLpips`).
+        st_lpips: for ST-LPIPS (`vestcl.evaluation.perceptual.StLpips`).
         size: (height, width) px that images are resized to and scored at; None is the clip's.
 
     Returns:

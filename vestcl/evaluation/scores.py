@@ -10,15 +10,15 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from vestcl import metrics
 from vestcl.data.resize import resize_image
 from vestcl.data.sample import Clip
+from vestcl.evaluation import metrics
+from vestcl.evaluation.border import blacken_border
+from vestcl.evaluation.perceptual import Lpips, StLpips, _squared_difference
+from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecasting import baselines
 from vestcl.forecasting.result import Forecast, View
 from vestcl.forecasting.views import seen_by
-from vestcl.models.trunks import Trunk
-from vestcl.perceptual import Lpips, StLpips, _squared_difference
-from vestcl.scoring.border import blacken_border
 
 #: The forecast without weights, as tables and files call it.
 GEOMETRIC: Final = "geometric"
@@ -107,7 +107,7 @@ class Truth:
         lpips: or None.
         st_lpips: or None.
         border: share of each side's outer pixels that are scored as black, in the truth and in what is held against
-            it (`vestcl.scoring.border.blacken_border`); SSIM's windows then reach beyond the image, as in VEST-MPI.
+            it (`vestcl.evaluation.border.blacken_border`); SSIM's windows then reach beyond the image, as in VEST-MPI.
     """
 
     def __init__(
@@ -306,7 +306,7 @@ def _scores(looks: Sequence[Look], wanted: Look, seen: torch.Tensor, truth: Trut
 def distance(
     maps: Sequence[torch.Tensor], wanted: Sequence[torch.Tensor], heads: Sequence[torch.Tensor] | None = None
 ) -> torch.Tensor:
-    """`vestcl.perceptual.squeeze_distance`, or with ``heads`` `Lpips` or `StLpips`, of maps that are there: [1].
+    """`vestcl.evaluation.perceptual.squeeze_distance`, or with ``heads`` `Lpips` or `StLpips`, of maps that are there: [1].
 
     Args:
         maps: [1, C_l, h_l, w_l] a layer.

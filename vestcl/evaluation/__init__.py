@@ -4,8 +4,8 @@ A window has frames t-1 and t in sight, and t+1 to t+steps as truth. Pictures an
 scored, and quantised to 8 bit.
 """
 
-from vestcl.scoring.motion import ego_errors, true_motion
-from vestcl.scoring.pictures import (
+from vestcl.evaluation.motion import ego_errors, true_motion
+from vestcl.evaluation.scores import (
     GEOMETRIC,
     ORACLE,
     OTHER_CAMERA,
@@ -22,7 +22,7 @@ from vestcl.scoring.pictures import (
     predictions,
     score,
 )
-from vestcl.scoring.tables import (
+from vestcl.evaluation.tables import (
     METRICS,
     Grid,
     Metric,

@@ -14,8 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.scoring.pictures import Record
-from vestcl.scoring.tables import METRICS, Grid, by_method, horizon, number, steps_of
+from vestcl.evaluation.scores import Record
+from vestcl.evaluation.tables import METRICS, Grid, by_method, horizon, number, steps_of
 
 #: Draws: the ends of an interval then vary by some hundredths of its width.
 RESAMPLES: Final = 2000
@@ -143,7 +143,7 @@ def extremes(records: Sequence[Record], metric: str, step: int) -> dict[str, Rec
 
     Args:
         records: of one view and method.
-        metric: of `vestcl.scoring.METRICS`.
+        metric: of `vestcl.evaluation.METRICS`.
         step: by which horizon, from 1.
 
     Raises:

@@ -1,8 +1,8 @@
 """Distances between images in the features of a classifier: LPIPS, ST-LPIPS, one without heads, and a training loss.
 
 Each takes two images [B, 3, H, W] in [0, 1], RGB, and answers with [B]; 0 for equal images. All are differentiable in
-both images; the classifiers' weights (vestcl.models.trunks) come from files and stay as they are. As metrics they
-are meant for 8-bit images: `vestcl.metrics.quantise` them first.
+both images; the classifiers' weights (vestcl.evaluation.trunks.trunks) come from files and stay as they are. As metrics they
+are meant for 8-bit images: `vestcl.evaluation.metrics.quantise` them first.
 """
 
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ from typing import Final
 import torch
 from torch import nn
 
+from vestcl.evaluation.st_lpips import INSTALLED, REMEDY, find_weights
+from vestcl.evaluation.trunks.shift_tolerant import ShiftTolerantTrunk, load_shift_tolerant
+from vestcl.evaluation.trunks.trunks import Normalisation, Trunk, load_trunk
 from vestcl.models.networks.layers import check
-from vestcl.models.shift_tolerant import ShiftTolerantTrunk, load_shift_tolerant
-from vestcl.models.trunks import Normalisation, Trunk, load_trunk
 from vestcl.models.weights_file import check_finite, read_state_dict
-from vestcl.st_lpips import INSTALLED, REMEDY, find_weights
 
 #: LPIPS's own scaling layer, after 2 x - 1: ImageNet's mean and deviation on [-1, 1], in three digits.
 LPIPS_SCALING: Final = Normalisation((-0.030, -0.088, -0.188), (0.458, 0.448, 0.450), gain=2.0, offset=-1.0)
