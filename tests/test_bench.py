@@ -11,7 +11,13 @@ import torch
 from tolerances import assert_close
 
 from vestcl import reference
-from vestcl.bench import _fragments, _measure, _peers, _results, _scenes, _timing, splat
+from vestcl.bench.common import results as _results
+from vestcl.bench.common import timing as _timing
+from vestcl.bench.splat import bench as splat
+from vestcl.bench.splat import measure as _measure
+from vestcl.bench.splat import scenes as _scenes
+from vestcl.bench.splat import torch_fragments as _fragments
+from vestcl.bench.splat import torch_peers as _peers
 
 #: Nothing runs longer than its least number of rounds.
 TINY: dict[str, Any] = {"height": 24, "width": 50, "seconds": 1e-3, "compile": False}

@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 
 from vestcl import cli
-from vestcl.bench import _results, compare
-from vestcl.bench._results import X_COPY, Measure, Results
-from vestcl.bench.compare import CompareBench
+from vestcl.bench.common import compare
+from vestcl.bench.common import results as _results
+from vestcl.bench.common.compare import CompareBench
+from vestcl.bench.common.results import X_COPY, Measure, Results
 
 
 def measure(name: str, median: float, spread: float = 0.1, unit: str = "s", better: str = "lower") -> Measure:

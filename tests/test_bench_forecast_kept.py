@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl.bench import _forecast_run as running
-from vestcl.bench import forecast as bench
-from vestcl.bench._forecast_kept import SUFFIX, Kept
-from vestcl.bench._forecast_list import evenly, read_list
-from vestcl.bench._forecast_truth import Facts
-from vestcl.bench.forecast import ForecastBench
+from vestcl.bench.forecast import bench
+from vestcl.bench.forecast import run as running
+from vestcl.bench.forecast.bench import ForecastBench
+from vestcl.bench.forecast.kept import SUFFIX, Kept
+from vestcl.bench.forecast.truth import Facts
+from vestcl.bench.forecast.windows_list import evenly, read_list
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
 from vestcl.evaluation import SOURCE, Record, Truth

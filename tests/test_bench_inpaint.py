@@ -1,4 +1,4 @@
-"""vestcl.bench.inpaint: the figures are those of known errors, and the table and file hold them."""
+"""vestcl.bench.forecast.inpaint: the figures are those of known errors, and the table and file hold them."""
 
 import json
 from pathlib import Path
@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl.bench import _open_pixels as open_pixels
-from vestcl.bench import inpaint
-from vestcl.bench.inpaint import InpaintBench, main, score
+from vestcl.bench.forecast import inpaint, open_pixels
+from vestcl.bench.forecast.inpaint import InpaintBench, main, score
 from vestcl.cli import main as command
 from vestcl.data import Street
 

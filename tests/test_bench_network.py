@@ -9,9 +9,9 @@ import pytest
 import torch
 from rich.console import Console
 
-from vestcl.bench import network
-from vestcl.bench._timing import Spread
-from vestcl.bench.network import NetworkBench, Part, Stopwatch, TimedForecaster, Timing
+from vestcl.bench.common.timing import Spread
+from vestcl.bench.network import bench as network
+from vestcl.bench.network.bench import NetworkBench, Part, Stopwatch, TimedForecaster, Timing
 from vestcl.constants import SKY_DEPTH
 from vestcl.data.street.raycast import SKY_DEPTH as STREET_SKY
 from vestcl.models import configuration

@@ -10,8 +10,9 @@ import pytest
 import torch
 from forecaster_scenes import ABLATIONS, SMALL, TINY, camera, pair_of, stir, turning
 
-from vestcl.bench import _results, _timing
-from vestcl.bench._network_speed import PLAIN, Group, Section, network_speed
+from vestcl.bench.common import results as _results
+from vestcl.bench.common import timing as _timing
+from vestcl.bench.network.variants import PLAIN, Group, Section, network_speed
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.skipping import Skip
 

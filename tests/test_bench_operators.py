@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 import torch
 
-from vestcl.bench import _results, operators
-from vestcl.bench._timing import LEAST_ROUNDS
-from vestcl.bench.operators import PASSES, OperatorsBench
+from vestcl.bench.common import results as _results
+from vestcl.bench.common.timing import LEAST_ROUNDS
+from vestcl.bench.splat import operators
+from vestcl.bench.splat.operators import PASSES, OperatorsBench
 from vestcl.opencl import session as runtime
 
 #: Nothing runs longer than its least number of rounds.

@@ -10,15 +10,17 @@ import pytest
 import torch
 from forecaster_scenes import SMALL, stir
 
-from vestcl.bench import _pareto_plots, _pareto_splatter, pareto
-from vestcl.bench._fragments import list_fragments
-from vestcl.bench._pareto_front import PRICE, Point, front, knee
-from vestcl.bench._pareto_knobs import EXACT, Setting, combinations, combined, describe
-from vestcl.bench._pareto_scenes import double, scene, shrunk
-from vestcl.bench._results import load
-from vestcl.bench._scenes import street
-from vestcl.bench._timing import Spread
-from vestcl.bench.pareto import ParetoBench
+from vestcl.bench.common.results import load
+from vestcl.bench.common.timing import Spread
+from vestcl.bench.pareto import bench as pareto
+from vestcl.bench.pareto import plots as _pareto_plots
+from vestcl.bench.pareto import splatter as _pareto_splatter
+from vestcl.bench.pareto.bench import ParetoBench
+from vestcl.bench.pareto.front import PRICE, Point, front, knee
+from vestcl.bench.pareto.knobs import EXACT, Setting, combinations, combined, describe
+from vestcl.bench.pareto.scenes import double, scene, shrunk
+from vestcl.bench.splat.scenes import street
+from vestcl.bench.splat.torch_fragments import list_fragments
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import quality
 from vestcl.models.inference.effort import Effort

@@ -11,11 +11,13 @@ import torch
 from forecaster_scenes import OBJECTS, SMALL, stir
 from PIL import Image
 
-from vestcl.bench import _pipeline_report, _results, _traffic
-from vestcl.bench._pipeline_measure import ALL, NONE, PEER, SWITCHES, TWICE, Pictures, SceneTimes, Stepper, variants
-from vestcl.bench._timing import Spread
-from vestcl.bench._traffic import EMPTY, EVERYTHING, JAM, STREETS, TRAFFIC, drive
-from vestcl.bench.pipeline import PipelineBench, load, main
+from vestcl.bench.common import results as _results
+from vestcl.bench.common.timing import Spread
+from vestcl.bench.pipeline import report as _pipeline_report
+from vestcl.bench.pipeline import traffic as _traffic
+from vestcl.bench.pipeline.bench import PipelineBench, load, main
+from vestcl.bench.pipeline.measure import ALL, NONE, PEER, SWITCHES, TWICE, Pictures, SceneTimes, Stepper, variants
+from vestcl.bench.pipeline.traffic import EMPTY, EVERYTHING, JAM, STREETS, TRAFFIC, drive
 from vestcl.models.config import EncoderConfig
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.skipping import NOTHING, Skip

@@ -14,9 +14,11 @@ from PIL import Image
 from rich.console import Console
 
 from vestcl import doctor
-from vestcl.bench import _plots, _report, _results
-from vestcl.bench._results import Measure, Results
-from vestcl.bench._timing import Spread
+from vestcl.bench.common import plots as _plots
+from vestcl.bench.common import results as _results
+from vestcl.bench.common.results import Measure, Results
+from vestcl.bench.common.timing import Spread
+from vestcl.bench.splat import report as _report
 from vestcl.evaluation.tables import Grid
 from vestcl.opencl import session as runtime
 

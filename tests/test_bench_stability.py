@@ -12,13 +12,15 @@ import pytest
 import torch
 
 from vestcl import constants, reference
-from vestcl.bench import _results, _stability_peers, stability
-from vestcl.bench._stability_bounds import UNIT, Bounds, bounds_of, growth
-from vestcl.bench._stability_cases import FAMILIES, SIZE, Case
-from vestcl.bench._stability_fragments import list_layers
-from vestcl.bench._stability_places import clear_radii, projected
-from vestcl.bench._stability_programs import OPERATORS, Operators, evaluate, relative_error
-from vestcl.bench.stability import Errors, StabilityBench
+from vestcl.bench.common import results as _results
+from vestcl.bench.stability import bench as stability
+from vestcl.bench.stability import peers as _stability_peers
+from vestcl.bench.stability.bench import Errors, StabilityBench
+from vestcl.bench.stability.bounds import UNIT, Bounds, bounds_of, growth
+from vestcl.bench.stability.cases import FAMILIES, SIZE, Case
+from vestcl.bench.stability.fragments import list_layers
+from vestcl.bench.stability.places import clear_radii, projected
+from vestcl.bench.stability.programs import OPERATORS, Operators, evaluate, relative_error
 from vestcl.opencl import session as runtime
 
 TWINS = Operators(reference.unproject, reference.rigid_flow, reference.displace, reference.splat)

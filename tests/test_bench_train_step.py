@@ -10,9 +10,9 @@ import torch
 from forecaster_scenes import SMALL, stir
 from PIL import Image
 
-from vestcl.bench import _results, train_step
-from vestcl.bench._traffic import LEAST_FRAMES, TRAFFIC, drive
-from vestcl.bench._train_measure import (
+from vestcl.bench.common import results as _results
+from vestcl.bench.network import train_step
+from vestcl.bench.network.train_measure import (
     ADAM,
     BACKWARD,
     EVERYTHING_LEARNS,
@@ -25,7 +25,8 @@ from vestcl.bench._train_measure import (
     measure_twin,
     stacked,
 )
-from vestcl.bench.train_step import TrainStepBench, main
+from vestcl.bench.network.train_step import TrainStepBench, main
+from vestcl.bench.pipeline.traffic import LEAST_FRAMES, TRAFFIC, drive
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.stage_times import REST, STAGES
 from vestcl.models.steps import render as _render

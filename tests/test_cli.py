@@ -98,11 +98,11 @@ def test_bench(monkeypatch: pytest.MonkeyPatch) -> None:
 
     configs: list[object] = []
     put_module(monkeypatch, "vestcl.bench")
-    put_module(monkeypatch, "vestcl.bench.splat", SplatBench=SplatBench, main=configs.append)
+    put_module(monkeypatch, "vestcl.bench.splat.bench", SplatBench=SplatBench, main=configs.append)
     assert cli.main(["bench", "splat"]) == 0
     assert cli.main(["bench", "splat", "--points", "5"]) == 0
     assert configs == [SplatBench(1000), SplatBench(5)]
-    monkeypatch.delitem(sys.modules, "vestcl.bench.inpaint", raising=False)
+    monkeypatch.delitem(sys.modules, "vestcl.bench.forecast.inpaint", raising=False)
     for mistake in ([], ["abacus"], ["inpaint"]):  # this stand-in has no bench of that name
         with pytest.raises(SystemExit):
             cli.main(["bench", *mistake])
@@ -117,7 +117,7 @@ def test_a_bench_does_not_need_the_others(monkeypatch: pytest.MonkeyPatch) -> No
 
     configs: list[object] = []
     put_module(monkeypatch, "vestcl.bench")
-    put_module(monkeypatch, "vestcl.bench.network", NetworkBench=NetworkBench, main=configs.append)
+    put_module(monkeypatch, "vestcl.bench.network.bench", NetworkBench=NetworkBench, main=configs.append)
     assert cli.main(["bench", "network", "--width", "9"]) == 0
     assert configs == [NetworkBench(9)]
 
@@ -132,11 +132,11 @@ def test_a_broken_bench_stands_in_nobodys_way(
         """Time splat."""
 
     def broken(path: str) -> object:
-        if path == "vestcl.bench.splat":
+        if path == "vestcl.bench.splat.bench":
             return SimpleNamespace(SplatBench=SplatBench)
-        if path == "vestcl.bench.pareto":
+        if path == "vestcl.bench.pareto.bench":
             return SimpleNamespace()
-        if path == "vestcl.bench.operators":
+        if path == "vestcl.bench.splat.operators":
             raise ModuleNotFoundError("No module named 'abacus'", name="abacus")
         raise ModuleNotFoundError(path, name=path)
 
@@ -159,7 +159,9 @@ def test_a_bench_with_a_hyphen_and_an_exit_code(monkeypatch: pytest.MonkeyPatch)
         code: int = 1
 
     put_module(monkeypatch, "vestcl.bench")
-    put_module(monkeypatch, "vestcl.bench.train_step", TrainStepBench=TrainStepBench, main=lambda config: config.code)
+    put_module(
+        monkeypatch, "vestcl.bench.network.train_step", TrainStepBench=TrainStepBench, main=lambda config: config.code
+    )
     assert cli.main(["bench", "train-step"]) == 1
     assert cli.main(["bench", "train-step", "--code", "0"]) == 0
 

@@ -9,7 +9,7 @@ import pytest
 import tyro
 
 from vestcl import cli, options
-from vestcl.bench.forecast import ForecastBench
+from vestcl.bench.forecast.bench import ForecastBench
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ import pytest
 import torch
 from forecaster_scenes import PAINTING, SMALL, TINY
 
-from vestcl.bench._pareto_knobs import Setting, describe
-from vestcl.bench._pareto_measure import step
-from vestcl.bench._pareto_scenes import Scene, scene
-from vestcl.bench._results import load
+from vestcl.bench.common.results import load
+from vestcl.bench.pareto.knobs import Setting, describe
+from vestcl.bench.pareto.measure import step
+from vestcl.bench.pareto.scenes import Scene, scene
 from vestcl.evaluation import metrics
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import pretrained, quality

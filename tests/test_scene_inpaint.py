@@ -8,7 +8,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from vestcl.bench.inpaint import street
+from vestcl.bench.forecast.inpaint import street
 from vestcl.scene.inpainting.inpaint import DEFAULT, inpaint_background
 from vestcl.scene.inpainting.inpainters import METHODS, Lama, inpainter
 from vestcl.scene.inpainting.structure import structure_behind

@@ -1,4 +1,4 @@
-"""vestcl.bench._roofline: what is counted, and that table, figures and plot agree with it."""
+"""vestcl.bench.splat.roofline: what is counted, and that table, figures and plot agree with it."""
 
 import json
 from pathlib import Path
@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from vestcl.bench import _roofline
-from vestcl.bench._kernels import bytes_of, flops_of
-from vestcl.bench._measure import Facts, facts_of
-from vestcl.bench._roofline import RooflineBench
-from vestcl.bench._roofs import Roofline, roofline
-from vestcl.bench._scenes import Scene, street
+from vestcl.bench.splat import roofline as _roofline
+from vestcl.bench.splat.kernels import bytes_of, flops_of
+from vestcl.bench.splat.measure import Facts, facts_of
+from vestcl.bench.splat.roofline import RooflineBench
+from vestcl.bench.splat.roofs import Roofline, roofline
+from vestcl.bench.splat.scenes import Scene, street
 from vestcl.opencl import session as runtime
 
 SIZE = (32, 48)

@@ -10,7 +10,7 @@ from kitti_trees import calibration
 
 from train.evaluate_windows import PART_WINDOWS, Part, plan
 from train.protocols import HELD_OUT, NOW, PROTOCOLS, Name, Where, currents
-from vestcl.bench.forecast import HELD_OUT as BENCH_HELD_OUT
+from vestcl.bench.forecast.bench import HELD_OUT as BENCH_HELD_OUT
 from vestcl.data.readers.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL, windows
 from vestcl.evaluation import METRICS
 from vestcl.io import write_pixels

@@ -13,8 +13,8 @@ from video_files import write_video
 
 from train.data import WindowSet
 from vestcl import cli
-from vestcl.bench import _forecast_run as running
-from vestcl.bench import forecast as bench
+from vestcl.bench.forecast import bench
+from vestcl.bench.forecast import run as running
 from vestcl.data import Street
 from vestcl.data.calibration import power
 from vestcl.data.sample import Clip

@@ -34,7 +34,7 @@ from train.evaluate_windows import Part, plan, read_inputs, read_part, run_part
 from train.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
 from vestcl import __version__, command_line, interrupt, options
-from vestcl.bench import _results
+from vestcl.bench.common import results as _results
 from vestcl.data.inputs import Inputs
 from vestcl.data.street import input as street_input
 from vestcl.evaluation import GEOMETRIC, Record, to_rich

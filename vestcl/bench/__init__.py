@@ -1,1 +1,1 @@
-"""Benchmarks, one a stem: `vestcl bench splat` is vestcl.bench.splat."""
+"""Benchmarks, one a stem: `vestcl bench splat` is vestcl.bench.splat.bench."""

@@ -14,7 +14,7 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
-from vestcl.bench._results import plain, settings, write_json
+from vestcl.bench.common.results import plain, settings, write_json
 from vestcl.data.readers.trajectories import KITTI_FPS, read_trajectory
 from vestcl.scene.motion.camera_forecast import CameraForecaster
 

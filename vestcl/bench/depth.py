@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from vestcl.bench._results import plain, settings, write_json
+from vestcl.bench.common.results import plain, settings, write_json
 from vestcl.data.later_frames import DepthOf
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip

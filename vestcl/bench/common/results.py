@@ -1,0 +1,323 @@
+"""What every benchmark hands over: figures with their noise and tables, a device at a time, on screen and in files."""
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import json
+import os
+import platform
+import sys
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+
+from vestcl import __version__, doctor
+from vestcl.bench.common.timing import Spread
+from vestcl.evaluation.tables import Grid, finite, to_markdown, to_rich
+from vestcl.io import atomic
+from vestcl.opencl import session as runtime
+
+#: The selector that means every device that works.
+ALL: Final = "all"
+
+#: What a measure's name ends with where it is another's time as a multiple of a copy of the same bytes, timed in turns
+#: with it. `vestcl bench compare` trusts it more than seconds: what slows the machine down slows the copy, too.
+X_COPY: Final = ", x copy"
+
+#: Columns of tables that don't go to a terminal.
+WIDTH: Final = 140
+
+#: Of the files: the value of "vestcl".
+_FORMAT: Final = 1
+
+_PACKAGES: Final = ("torch", "numpy", "pyopencl", "pocl-binary-distribution")
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One figure of a benchmark: median and quartiles over its runs."""
+
+    name: str
+    """Unique in its `Results`, and the same from run to run."""
+    unit: str
+    """ "s", "B", "dB", "1" (a ratio, a relative error), ..."""
+    median: float
+    low: float
+    """First quartile."""
+    high: float
+    """Third quartile."""
+    better: Literal["lower", "higher"] = "lower"
+
+    @classmethod
+    def of(cls, name: str, unit: str, spread: Spread, better: Literal["lower", "higher"] = "lower") -> "Measure":
+        """The measure of several runs."""
+        return cls(name, unit, spread.median, spread.low, spread.high, better)
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a benchmark found out on one device."""
+
+    bench: str
+    """As in `vestcl bench NAME`."""
+    machine: dict[str, str]
+    """What `describe` tells."""
+    config: dict[str, Any]
+    """What `settings` makes of the benchmark's configuration."""
+    measures: list[Measure]
+    grids: list[Grid]
+    """For the screen and Markdown; they are not in JSON."""
+    details: dict[str, Any]
+    """Whatever else is worth keeping; see `plain` for what it may hold."""
+
+
+# ---------------------------------------------------------------- devices
+
+
+def each_device(selector: str | None, console: Console | None = None) -> Generator[runtime.Session, None, None]:
+    """Sessions to measure on, one after the other; each is vestcl's current one until the next is asked for.
+
+    Args:
+        selector: as in `runtime.select`; or "all": every device that passes `vestcl doctor`, each tried in a process of
+            its own first, because a driver may kill the one that loads it.
+        console: where devices that don't work are reported; None is the error output.
+
+    Yields:
+        The session, inside `runtime.use`.
+
+    Raises:
+        DeviceError: no such device, or with "all" none that works.
+    """
+    for index in _usable(console or Console(stderr=True)) if selector == ALL else [selector]:
+        with runtime.use(index) as session:
+            yield session
+
+
+def measure_each(
+    selector: str | None, measure: Callable[[runtime.Session], Results], console: Console
+) -> list[Results]:
+    """``measure`` on `each_device`. With "all", a device that fails is reported and the others go on.
+
+    Args:
+        selector: as in `each_device`.
+        measure: of one device, which is vestcl's current one.
+        console: where failures are reported.
+
+    Returns:
+        The results of the devices that did not fail, one at least.
+
+    Raises:
+        DeviceError: no such device, or with "all" none that works.
+    """
+    with contextlib.closing(each_device(selector, console)) as sessions:  # an error must not leave a device in use
+        found = [_tried(session, measure, console, selector == ALL) for session in sessions]
+    results = [result for result in found if result is not None]
+    if not results:
+        raise runtime.DeviceError("the benchmark failed on every device")
+    return results
+
+
+def _tried(
+    session: runtime.Session, measure: Callable[[runtime.Session], Results], console: Console, others_go_on: bool
+) -> Results | None:
+    try:
+        return measure(session)
+    except Exception as error:  # drivers fail in many ways, and runtime alone knows pyopencl's
+        if isinstance(error, ValueError) or not others_go_on:  # a mistake in the settings is no device's
+            raise
+        _report(console, session.info, f"{type(error).__name__}: {error}")
+        return None
+
+
+def _usable(console: Console) -> list[str]:
+    with console.status("trying every OpenCL device"):
+        report = doctor.examine()
+    for device in report.devices:
+        if not device.works:
+            _report(console, device.info, next(iter(device.notes), "does not work"))
+    works = [device.info.index for device in report.devices if device.works]
+    if not works:
+        raise runtime.DeviceError("no OpenCL device works: `vestcl doctor` tells why")
+    return works
+
+
+def _report(console: Console, info: runtime.DeviceInfo, reason: str) -> None:
+    console.print(Text(f"{info.index} {info.platform} / {info.name} left out: {reason}", "red"), soft_wrap=True)
+
+
+def console(width: int | None = None) -> Console:
+    """Standard output: a terminal of its own width, or a file of ``width`` columns, None being WIDTH."""
+    return Console(width=None if sys.stdout.isatty() else width or WIDTH)
+
+
+def write_json(path: Path, results: dict[str, Any]) -> None:
+    """Write ``results`` whole or not at all; ``path`` is the old file until then.
+
+    Raises:
+        TypeError: something that JSON does not have.
+        ValueError: the folder can't be made.
+    """
+    atomic.write_bytes(path, (json.dumps(results, indent=1) + "\n").encode())
+
+
+def describe(session: runtime.Session) -> dict[str, str]:
+    """What the numbers depend on: versions, device, processor, date."""
+    versions = {}
+    for package in _PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[package] = importlib.metadata.version(package)
+    return {
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "vestcl": __version__,
+        **versions,
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "device": f"{session.info.index} {session.info.platform} / {session.info.name}",
+        "driver": session.info.driver,
+        "compute units": str(session.info.compute_units),
+        "mapping": session.mapping,
+        "processor": _processor(),
+        "cores": str(os.cpu_count()),
+    }
+
+
+def _processor() -> str:
+    """The CPU's model, as its maker calls it."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+# ---------------------------------------------------------------- screen and files
+
+
+def show(results: Sequence[Results], console: Console) -> None:
+    """Print each device, what the numbers depend on, and its tables."""
+    for result in results:
+        show_machine(result.machine, console)
+        for grid in result.grids:
+            console.print(to_rich(grid))
+
+
+def show_machine(machine: dict[str, str], console: Console) -> None:
+    """Print what the numbers depend on."""
+    for name, value in machine.items():
+        console.print(f"{name}: {value}", soft_wrap=True, highlight=False, markup=False)
+
+
+def save(results: Sequence[Results], json: Path | None, markdown: Path | None) -> None:
+    """Write the results, each file whole or not at all.
+
+    Args:
+        results: of one benchmark, a device each.
+        json: file {"vestcl": 1, "bench": ..., "devices": [{"machine", "config", "measures", "details"}]}, or None.
+        markdown: file with machine and tables of each device, or None.
+
+    Raises:
+        ValueError: nothing to save, results of several benchmarks, a value that `plain` refuses, a folder that can't be
+            made.
+    """
+    benches = {result.bench for result in results}
+    if len(benches) != 1:
+        raise ValueError(f"`results` must be of one bench, got {', '.join(sorted(benches)) or 'none'}")
+    if json is not None:
+        atomic.write_bytes(json, _to_json(results).encode())
+    if markdown is not None:
+        atomic.write_bytes(markdown, "\n".join(map(_to_markdown, results)).encode())
+
+
+def tell_written(console: Console, *paths: Path | None) -> None:
+    """Print which files and folders there are now."""
+    for path in paths:
+        if path is not None:
+            console.print(f"wrote {path}", soft_wrap=True, highlight=False, markup=False)
+
+
+def load(path: Path) -> list[Results]:
+    """What `save` wrote as JSON; tables are not in there.
+
+    Raises:
+        ValueError: the file can't be read or is none of `save`'s; the message names it and what it lacks.
+    """
+    try:
+        content = json.loads(atomic.read_bytes(path))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: no JSON: {error}") from error
+    if not isinstance(content, dict) or content.get("vestcl") != _FORMAT:
+        raise ValueError(f'{path}: must be a file of `vestcl bench NAME --json` with "vestcl": {_FORMAT}')
+    try:
+        return [_device(content["bench"], device) for device in content["devices"]]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(f"{path}: a benchmark's file lacks or mistakes {error}") from error
+
+
+def check_positive(config: Any, *names: str) -> None:
+    """Refuse settings that are not above 0.
+
+    Raises:
+        ValueError: the message names the first.
+    """
+    for name in names:
+        if getattr(config, name) <= 0:
+            raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
+
+
+def settings(config: Any) -> dict[str, Any]:
+    """The fields of a benchmark's dataclass as JSON has them; files and folders as text."""
+    return dict(plain(dataclasses.asdict(config)))
+
+
+def plain(value: Any) -> Any:
+    """``value`` as JSON has it: dataclasses become objects, tuples and arrays lists, paths text, NaN and infinity null.
+
+    Raises:
+        ValueError: something that JSON has no word for.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return plain(vars(value))
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic | np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, Path):
+        return str(value)
+    if value is not None and not isinstance(value, str | bool | int | float):
+        raise ValueError(f"results must be plain values and dataclasses, got {type(value).__name__}")
+    return finite(value)
+
+
+def _to_json(results: Sequence[Results]) -> str:
+    devices = [{name: getattr(r, name) for name in ("machine", "config", "measures", "details")} for r in results]
+    return json.dumps(plain({"vestcl": _FORMAT, "bench": results[0].bench, "devices": devices}), indent=1) + "\n"
+
+
+def _to_markdown(result: Results) -> str:
+    facts = "".join(f"- {name}: {value}\n" for name, value in result.machine.items())
+    chosen = ", ".join(f"{name} {value}" for name, value in result.config.items() if value is not None)
+    tables = "\n".join(map(to_markdown, result.grids))
+    title = f"vestcl bench {result.bench}, {result.machine.get('device', 'unknown device')}"
+    return f"## {title}\n\n{facts}- settings: {chosen}\n\n{tables}"
+
+
+def _device(bench: str, device: dict[str, Any]) -> Results:
+    measures = [_measure(measure) for measure in device["measures"]]
+    return Results(str(bench), dict(device["machine"]), dict(device["config"]), measures, [], dict(device["details"]))
+
+
+def _measure(content: dict[str, Any]) -> Measure:
+    median, low, high = (
+        float("nan") if content[key] is None else float(content[key]) for key in ("median", "low", "high")
+    )
+    if content["better"] not in ("lower", "higher"):
+        raise TypeError(f'"better": {content["better"]!r}')
+    return Measure(content["name"], content["unit"], median, low, high, content["better"])

@@ -1,0 +1,150 @@
+"""`vestcl bench inpaint`: what each method makes of the background, against the street without its foreground.
+
+With clips: what forecasts show where no pixel of frames t and t-1 is, with and without a memory.
+"""
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from vestcl.bench.common.results import describe, write_json
+from vestcl.bench.forecast import open_pixels
+from vestcl.constants import SKY_DEPTH
+from vestcl.data import Street, intrinsics
+from vestcl.data.open import open_sequence
+from vestcl.data.street.raycast import SKY_DEPTH as STREET_SKY
+from vestcl.evaluation.perceptual import StLpips
+from vestcl.evaluation.st_lpips import Option as StLpipsOption
+from vestcl.io.labels import background
+from vestcl.opencl import session as runtime
+from vestcl.scene.inpainting.inpaint import DEFAULT, inpaint_background
+from vestcl.scene.inpainting.inpainters import METHODS
+
+#: Seeds of the streets, which nothing is trained on.
+FIRST_SEED: Final = 2000
+
+#: A depth is right within that share.
+_RIGHT: Final = 0.1
+
+Scores = dict[str, float]
+
+
+@dataclass(frozen=True)
+class InpaintBench:
+    """Fill in behind the foreground of procedural streets, and compare with what is there."""
+
+    streets: int = 20
+    """How many."""
+    height: int = 256
+    """Pixels."""
+    width: int = 832
+    """Pixels."""
+    methods: tuple[str, ...] = tuple(METHODS)
+    """Names, or lama:PATH."""
+    clips: tuple[str, ...] = ()
+    """Forecast these clips instead, at the size above, and score the pixels that frames t and t-1 leave open."""
+    memory: tuple[int, ...] = (0, 2, 3, 5, 10)
+    """Numbers of remembered frames to compare on clips."""
+    windows: int = 6
+    """Windows of each clip, spread over it."""
+    st_lpips: StLpipsOption = None
+    """Measure ST-LPIPS on clips, by the weights FILE or those inside an installed stlpips-pytorch."""
+    device: str | None = None
+    """OpenCL device that renders."""
+    json: Path | None = None
+    """File for the figures."""
+
+    def __post_init__(self) -> None:
+        if self.streets < 1:
+            raise ValueError(f"`streets` must be 1 or more, got {self.streets}")
+        if self.windows < 1:
+            raise ValueError(f"`windows` must be 1 or more, got {self.windows}")
+        if not self.memory or min(self.memory) < 0:
+            raise ValueError(f"`memory` must be one or more numbers of frames, 0 or more each, got {self.memory}")
+
+
+def main(config: InpaintBench) -> None:
+    """Measure and print the table."""
+    console = Console()
+    with runtime.use(config.device):
+        about = describe(runtime.current())
+        if config.clips:
+            _measure_clips(config, about, console)
+            return
+        scores: dict[str, list[Scores]] = {method: [] for method in config.methods}
+        for seed in track(range(FIRST_SEED, FIRST_SEED + config.streets), "streets", console=console, transient=True):
+            frame = street(seed, config.height, config.width)
+            for method in config.methods:
+                scores[method].append(score(method, *frame))
+    means = {method: _mean(rows) for method, rows in scores.items()}
+    console.print(_table(means, config))
+    if config.json is not None:
+        write_json(config.json, {"about": about, "streets": config.streets, "means": means, "scores": scores})
+
+
+def _measure_clips(config: InpaintBench, about: dict[str, str], console: Console) -> None:
+    distance = None if config.st_lpips is None else StLpips.load(config.st_lpips)
+    scores: list[open_pixels.OpenScore] = []
+    for name in config.clips:
+        clip = open_sequence(name).resized(config.height, config.width)
+        indices = open_pixels.windows_of(clip, config.windows, config.memory)
+        found = list(open_pixels.measure(clip, indices, config.memory, distance))
+        console.print(open_pixels.table_of(found, f"{clip.name}, {len(indices)} windows"))
+        scores += found
+    if config.json is not None:
+        write_json(config.json, {"about": about, "scores": [asdict(one) for one in scores]})
+
+
+def street(seed: int, height: int, width: int) -> tuple[NDArray[Any], ...]:
+    """Image, depth, mask, and the true background's image and depth."""
+    scene, K = Street.generate(seed), intrinsics(height, width)
+    camera, t = np.linalg.inv(scene.camera_pose(1.0)), 1.0
+    shown = scene.render(camera, K, height, width, t, samples=2)
+    truth = scene.render(camera, K, height, width, t, samples=2, foreground=False)
+    depths = (np.where(frame.depth[0] >= STREET_SKY, np.float32(SKY_DEPTH), frame.depth[0]) for frame in (shown, truth))
+    depth, true_depth = depths
+    return shown.colour[0], depth, background(shown.labels[0]), truth.colour[0], true_depth
+
+
+def score(
+    method: str,
+    image: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    true_image: NDArray[np.float32],
+    true_depth: NDArray[np.float32],
+) -> Scores:
+    """PSNR dB of the colour, median and share within 10 % of the depth, where M = 0; seconds."""
+    start = time.perf_counter()
+    filled, filled_depth = inpaint_background(image, depth, mask, method=method)
+    seconds, hidden = time.perf_counter() - start, ~mask[0]
+    error = np.square(filled - true_image)[:, hidden].mean()
+    off = np.abs(filled_depth / true_depth - 1)[0][hidden]
+    return {
+        "psnr": float(-10 * np.log10(max(error, 1e-12))),
+        "depth_median": float(np.median(off)),
+        "depth_right": float((off < _RIGHT).mean()),
+        "seconds": seconds,
+    }
+
+
+def _mean(rows: list[Scores]) -> Scores:
+    return {name: float(np.mean([scores[name] for scores in rows])) for name in rows[0]}
+
+
+def _table(means: dict[str, Scores], config: InpaintBench) -> Table:
+    title = f"behind the foreground of {config.streets} streets, {config.height} x {config.width}"
+    table = Table("method", "PSNR", "depth, median error", "depth within 10 %", "time", box=box.SIMPLE, title=title)
+    for method, mean in sorted(means.items(), key=lambda item: -item[1]["psnr"]):
+        name = f"{method} (default)" if method == DEFAULT else method
+        cells = f"{mean['psnr']:.2f} dB", f"{mean['depth_median']:.1%}", f"{mean['depth_right']:.0%}"
+        table.add_row(name, *cells, f"{mean['seconds']:.2f} s")
+    return table
