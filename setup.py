@@ -49,5 +49,5 @@ setup(
         "intel": ["intel-cmplr-lib-rt", "intel-opencl-rt"],
         "train": TRAIN,
     },
-    entry_points={"console_scripts": ["vestcl = vestcl.cli:main"]},
+    entry_points={"console_scripts": ["vestcl = vestcl.cli.main:main"]},
 )

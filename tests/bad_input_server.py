@@ -51,7 +51,7 @@ def captured() -> Iterator[list[str]]:
 
 def run(case: Case) -> int | str:
     """The exit status, or what else happened."""
-    name = {"vestcl": "vestcl.cli"}.get(case.program, case.program)
+    name = {"vestcl": "vestcl.cli.main"}.get(case.program, case.program)
     try:
         sys.argv = [case.program, *case.arguments]
         return int(importlib.import_module(name).main())

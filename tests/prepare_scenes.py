@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 from data_files import write_text
 
-from vestcl import cli, prepare_command
+from vestcl.cli import main as cli
+from vestcl.cli import prepare as prepare_command
 from vestcl.io.images import to_pixels, write_pixels
 
 ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH, FRAMES = 48, 160, 4
 
 #: The command in a process of its own.
-COMMAND = (sys.executable, "-c", "import sys; from vestcl.cli import main; sys.exit(main())", "prepare")
+COMMAND = (sys.executable, "-c", "import sys; from vestcl.cli.main import main; sys.exit(main())", "prepare")
 SMALL = ("--height", str(HEIGHT), "--width", str(WIDTH), "--frames", str(FRAMES), "--samples", "1")
 
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from vestcl import cli
 from vestcl.bench.common import compare
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.compare import CompareBench
 from vestcl.bench.common.results import X_COPY, Measure, Results
+from vestcl.cli import main as cli
 
 
 def measure(name: str, median: float, spread: float = 0.1, unit: str = "s", better: str = "lower") -> Measure:

@@ -8,9 +8,9 @@ import pytest
 from corridor_scenes import K, ahead, drive
 from onnx_files import write_mix
 
-from vestcl import cli
 from vestcl.bench import depth
 from vestcl.bench.depth import DepthBench
+from vestcl.cli import main as cli
 from vestcl.data.sample import Clip, Sample
 
 

@@ -11,12 +11,12 @@ import torch
 from onnx_files import write_mix
 from st_lpips_weights import public_state
 
-from vestcl import cli
 from vestcl.bench.forecast import bench, tables, windows
 from vestcl.bench.forecast import run as running
 from vestcl.bench.forecast import truth as known
 from vestcl.bench.forecast.bench import HELD_OUT, ForecastBench
 from vestcl.bench.forecast.windows import GEOMETRIC, ORACLE, SOURCE, TRUE_POSES, Prediction, Record, Truth
+from vestcl.cli import main as cli
 from vestcl.data import Street
 from vestcl.data.calibration import invert
 from vestcl.data.sample import Clip, Sample

@@ -9,7 +9,7 @@ import pytest
 
 from vestcl.bench.forecast import inpaint, open_pixels
 from vestcl.bench.forecast.inpaint import InpaintBench, main, score
-from vestcl.cli import main as command
+from vestcl.cli.main import main as command
 from vestcl.data import Street
 
 

@@ -10,7 +10,8 @@ from typing import get_args, get_type_hints
 import pytest
 from stand_ins import put_module
 
-from vestcl import __version__, cli, doctor
+from vestcl import __version__, doctor
+from vestcl.cli import main as cli
 from vestcl.io.labels import LabelKind
 from vestcl.opencl import session as runtime
 
@@ -62,7 +63,7 @@ def test_help_and_mistakes(arguments: str, code: int, capsys: pytest.CaptureFixt
 def test_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
     put_module(
-        monkeypatch, "vestcl.demo", run=lambda *arguments: calls.append((*arguments, runtime.current().info.index))
+        monkeypatch, "vestcl.cli.demo", run=lambda *arguments: calls.append((*arguments, runtime.current().info.index))
     )
     last = runtime.devices()[-1].index
     before = runtime.current()
@@ -84,7 +85,7 @@ def test_what_a_user_can_put_right_is_one_line(
     def run(*_: object) -> None:
         raise kind("`height` must be even, got 1")
 
-    put_module(monkeypatch, "vestcl.demo", run=run)
+    put_module(monkeypatch, "vestcl.cli.demo", run=run)
     assert cli.main(["demo", "--height", "1"]) == 2
     assert capsys.readouterr().err == "error: --height must be even, got 1\n"
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from stand_ins import put_module
 
-from vestcl import cli
+from vestcl.cli import main as cli
 from vestcl.opencl import pocl_cache
 from vestcl.opencl import session as runtime
 
 ROOT = Path(__file__).resolve().parents[1]
-DEVICES = [sys.executable, "-c", "import sys; from vestcl.cli import main; sys.exit(main())", "devices"]
+DEVICES = [sys.executable, "-c", "import sys; from vestcl.cli.main import main; sys.exit(main())", "devices"]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
@@ -33,7 +33,7 @@ def test_errors_of_the_machine_are_one_line(
     def run(*_: object) -> None:
         raise error
 
-    put_module(monkeypatch, "vestcl.demo", run=run)
+    put_module(monkeypatch, "vestcl.cli.demo", run=run)
     assert cli.main(["demo"]) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.startswith(f"error: {line}") and err.count("\n") == 1
@@ -43,7 +43,7 @@ def test_vestcls_own_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch
     def run(*_: object) -> None:
         raise RuntimeError("a fault of vestcl")
 
-    put_module(monkeypatch, "vestcl.demo", run=run)
+    put_module(monkeypatch, "vestcl.cli.demo", run=run)
     with pytest.raises(RuntimeError, match="a fault of vestcl"):
         cli.main(["demo"])
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vestcl import demo
+from vestcl.cli import demo
 from vestcl.data import Street
 from vestcl.forecasting.views import parse_view
 from vestcl.models import configuration

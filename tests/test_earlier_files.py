@@ -11,7 +11,7 @@ import train_scenes
 import yaml
 
 from train import fit
-from vestcl import cli
+from vestcl.cli import main as cli
 from vestcl.models import config
 from vestcl.models.inference.pretrained import load_model
 from vestcl.prepare.prepared import find_prepared

@@ -13,7 +13,7 @@ from onnx_files import write_mix
 from st_lpips_weights import public_state
 from stand_ins import put_module
 
-from vestcl import cli
+from vestcl.cli import main as cli
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
 from vestcl.evaluation.trunks.trunks import Trunk

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from test_learned import model, stir_all
 
-from vestcl import cli
+from vestcl.cli import main as cli
+from vestcl.cli.forecast import where_another_is_better
 from vestcl.evaluation.compare import Comparison
-from vestcl.forecast_command import where_another_is_better
 from vestcl.forecasting.files import read_forecast
 
 

@@ -11,7 +11,7 @@ from forecast_clips import Repeater, write_clip
 from forecaster_scenes import SMALL, TINY
 from stand_ins import put_module
 
-from vestcl import cli
+from vestcl.cli import main as cli
 from vestcl.data.sample import Clip
 from vestcl.evaluation.compare import ORACLE
 from vestcl.forecasting.files import read_forecast

@@ -79,7 +79,7 @@ def test_the_help_loads_neither_torch_nor_opencl() -> None:
     heavy = ("torch", "pyopencl", "numpy", "cv2", "scipy", "skimage", "matplotlib", "pandas")
     script = f"""
 import contextlib, io, sys
-from vestcl.cli import main
+from vestcl.cli.main import main
 for command in ([], ["forecast"], ["devices"]):
     with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
         main([*command, "--help"])

@@ -12,7 +12,8 @@ import pytest
 from prepare_scenes import COMMAND
 from stand_ins import put_module
 
-from vestcl import cli, interrupt
+from vestcl.cli import interrupt
+from vestcl.cli import main as cli
 from vestcl.io.atomic import replacing, write_bytes
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -87,7 +88,7 @@ def test_a_command_that_is_called(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("module", ["numpy", "tyro"])
 def test_while_modules_are_imported(module: str) -> None:
-    code = "import sys; from vestcl.cli import main; sys.exit(main())"
+    code = "import sys; from vestcl.cli.main import main; sys.exit(main())"
     command = [sys.executable, "-X", "importtime", "-c", code, "devices"]
     status, _, said = stopped(command, f" {module}\n", "stderr")
     assert status == 130
@@ -146,7 +147,7 @@ def test_what_other_code_makes_of_it(
         except KeyboardInterrupt as stop:
             raise kind("numpy.core.multiarray failed to import") from stop
 
-    put_module(monkeypatch, "vestcl.demo", run=run)
+    put_module(monkeypatch, "vestcl.cli.demo", run=run)
     assert cli.main(["demo"]) == 130
     assert capsys.readouterr() == ("", NOTHING)
 

@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from train import checkpoint
-from vestcl import cli
+from vestcl.cli import main as cli
 from vestcl.evaluation.perceptual import Lpips, VggLoss
 from vestcl.evaluation.trunks.trunks import Trunk, load_trunk
 from vestcl.models.checkpoint import read_checkpoint, write_checkpoint

@@ -8,8 +8,9 @@ from typing import Any, ClassVar
 import pytest
 import tyro
 
-from vestcl import cli, options
 from vestcl.bench.forecast.bench import ForecastBench
+from vestcl.cli import main as cli
+from vestcl.cli import options
 
 
 @dataclass(frozen=True)

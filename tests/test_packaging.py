@@ -72,7 +72,7 @@ def test_the_wheel_holds_every_kernel_and_module_and_nothing_else(wheel: Path, c
     with zipfile.ZipFile(wheel) as archive:
         shipped = {name for name in archive.namelist() if ".dist-info/" not in name}
         entry_points = next(name for name in archive.namelist() if name.endswith("entry_points.txt"))
-        assert "vestcl = vestcl.cli:main" in archive.read(entry_points).decode()
+        assert "vestcl = vestcl.cli.main:main" in archive.read(entry_points).decode()
     kernels = {f"vestcl/kernels/{name}" for name in files(checkout / "kernels", "*.cl", "*.h")}
     modules = {f"vestcl/{name}" for name in files(checkout / "vestcl", "*.py")}
     assert kernels

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from vestcl import interrupt
+from vestcl.cli import interrupt
 from vestcl.opencl import icd, pocl_cache
 from vestcl.opencl import session as runtime
 

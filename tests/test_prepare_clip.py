@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from prepare_scenes import COMMAND, FRAMES, HEIGHT, ROOT, SMALL, WIDTH, contents, options, run, told, until, write_drive
 
-from vestcl import prepare_command
+from vestcl.cli import prepare as prepare_command
 from vestcl.data import calibration
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip, RightCamera, Sample

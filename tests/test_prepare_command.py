@@ -11,7 +11,8 @@ from data_files import write_text
 from onnx_files import write_mix
 from prepare_scenes import FRAMES, HEIGHT, SMALL, WIDTH, contents, counted, options, run, write_drive
 
-from vestcl import cli, prepare_command
+from vestcl.cli import main as cli
+from vestcl.cli import prepare as prepare_command
 from vestcl.io.images import write_pixels
 from vestcl.prepare.clip import frame_keys
 from vestcl.prepare.files import frame_path

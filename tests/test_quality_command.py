@@ -7,7 +7,7 @@ from forecast_clips import Repeater, write_clip
 from forecaster_scenes import SMALL
 from stand_ins import put_module
 
-from vestcl import cli
+from vestcl.cli import main as cli
 from vestcl.forecasting.files import read_forecast
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import quality

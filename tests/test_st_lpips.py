@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from st_lpips_weights import public_state
 from torch.nn import functional
 
-from vestcl import cli
+from vestcl.cli import main as cli
 from vestcl.evaluation import st_lpips
 from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.scores import distance

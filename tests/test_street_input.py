@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl import cli
+from vestcl.cli import main as cli
+from vestcl.cli.prepare import open_input, plan
 from vestcl.data import SKY_DEPTH, Label, Street
 from vestcl.data.inputs import inputs_of
 from vestcl.data.street import input as street_input
@@ -19,7 +20,6 @@ from vestcl.data.street.sensors import DisturbedLabels, StreetScan
 from vestcl.opencl import session as runtime
 from vestcl.prepare.clip import frame_keys
 from vestcl.prepare.prepared import find_prepared
-from vestcl.prepare_command import open_input, plan
 
 SIZE = HEIGHT, WIDTH = 48, 160
 

@@ -22,13 +22,13 @@ from train.evaluate_inputs import (
 from train.evaluate_setup import Setup
 from train.evaluate_windows import forecast, inputs_of, perceptions_of, prepared, presenters, views_of, window
 from train.protocols import NOW, NOW_BORDER, PROTOCOLS, Name
+from vestcl.cli.forecast import Estimators
 from vestcl.data import Street
 from vestcl.data.inputs import Inputs
 from vestcl.data.sample import Clip, RightCamera
 from vestcl.data.sources import DisparityFile, ImageArray
 from vestcl.evaluation import GEOMETRIC, SOURCE, Truth, metrics
 from vestcl.evaluation.border import blacken_border
-from vestcl.forecast_command import Estimators
 from vestcl.forecasting.result import View
 from vestcl.forecasting.views import parse_view
 from vestcl.models.forecaster import Forecaster

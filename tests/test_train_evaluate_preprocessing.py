@@ -15,7 +15,7 @@ from train import evaluate
 from train.evaluate import main
 from train.evaluate_inputs import PAIR
 from train.evaluate_options import Evaluation
-from vestcl import cli
+from vestcl.cli import main as cli
 from vestcl.data import Street
 from vestcl.data.readers.splits import KITTI_VIEWS_TEST
 from vestcl.evaluation import GEOMETRIC

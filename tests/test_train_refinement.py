@@ -14,13 +14,13 @@ from forecaster_scenes import SMALL
 from train import forecasts, refinement, refinement_scores, trainer
 from train.forecasts import Entry, Window, pack, unpack
 from train.refinement import LOG, STATE, RefinementConfig, Samples, load_config, train, with_forecast_refinement
+from vestcl.cli.prepare import open_input
 from vestcl.data import Street
 from vestcl.forecasting.geometric import Perception, forecast_frames
 from vestcl.forecasting.network.planes import forecast_planes
 from vestcl.forecasting.result import View
 from vestcl.models.checkpoint import read_trained_on
 from vestcl.models.forecaster import Forecaster
-from vestcl.prepare_command import open_input
 
 STREET = "street:3?drive=road,fps=20"
 SIZE = ("--height", "48", "--width", "96")

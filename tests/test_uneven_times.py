@@ -12,9 +12,9 @@ from test_network_input import MOTIONS, displaced, prepared
 from video_files import write_video
 
 from train.data import WindowSet
-from vestcl import cli
 from vestcl.bench.forecast import bench
 from vestcl.bench.forecast import run as running
+from vestcl.cli import main as cli
 from vestcl.data import Street
 from vestcl.data.calibration import power
 from vestcl.data.sample import Clip

@@ -2,7 +2,7 @@
 
 import sys
 
-from vestcl import interrupt
+from vestcl.cli import interrupt
 
 if sys.argv[:1] == ["-m"]:  # Python looks for the script that it runs next: its imports take seconds
     interrupt.guard_imports()

@@ -27,7 +27,7 @@ from train.config import Config, from_dict
 from train.evaluate_options import Evaluation
 from train.protocols import PROTOCOLS
 from train.report import LOG, read_log
-from vestcl import command_line, interrupt
+from vestcl.cli import command_line, interrupt
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.checkpoint import read_checkpoint
 from vestcl.models.inference.pretrained import find_model

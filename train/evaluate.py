@@ -33,8 +33,11 @@ from train.evaluate_sheets import write_sheets
 from train.evaluate_windows import Part, plan, read_inputs, read_part, run_part
 from train.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
 from train.ranks import Ranks, local_rank
-from vestcl import __version__, command_line, interrupt, options
+from vestcl import __version__
 from vestcl.bench.common import results as _results
+from vestcl.cli import command_line, interrupt, options
+from vestcl.cli.prepare import shard
+from vestcl.cli.progress import Bar
 from vestcl.data.inputs import Inputs
 from vestcl.data.street import input as street_input
 from vestcl.evaluation import GEOMETRIC, Record, to_rich
@@ -46,8 +49,6 @@ from vestcl.io.atomic import write_bytes
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.opencl import session as runtime
-from vestcl.prepare_command import shard
-from vestcl.progress import Bar
 
 #: Columns where tables don't go to a terminal.
 WIDTH: Final = 200

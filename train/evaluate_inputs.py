@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from train.protocols import Protocol
+from vestcl.cli.forecast import Estimators, load_estimators, with_estimates
 from vestcl.data.inputs import Inputs, inputs_of, is_matched
 from vestcl.data.sample import Clip
 from vestcl.evaluation import RIGHT
-from vestcl.forecast_command import Estimators, load_estimators, with_estimates
 from vestcl.forecasting.geometric import Perception
 from vestcl.prepare.perception import PreparedPerception, PreparedSequence
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter

@@ -10,9 +10,9 @@ from train.evaluate_options import Evaluation
 from train.evaluate_windows import PART_WINDOWS
 from train.protocols import Protocol
 from vestcl import __version__
+from vestcl.cli.prepare import identity
 from vestcl.evaluation import st_lpips
 from vestcl.prepare.files import JSON
-from vestcl.prepare_command import identity
 
 #: Settings that scores do not depend on, or that stand in the key as the content of files.
 _NOT_IN_KEY: Final = (

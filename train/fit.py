@@ -29,7 +29,7 @@ from train.losses import build_perceptual
 from train.ranks import Ranks, lost_processes_named
 from train.report import Reporter
 from train.trainer import Average, NotANumberError, Trainer, build_model
-from vestcl import command_line, interrupt
+from vestcl.cli import command_line, interrupt
 from vestcl.data.readers.splits import KITTI_TRAINING
 from vestcl.models.checkpoint import Frames, read_trained_on
 from vestcl.models.config import ModelConfig

@@ -30,7 +30,7 @@ from train.config import RULES, Count, CountOrNone, LossConfig, OptimiserConfig,
 from train.forecasts import unpack
 from train.losses import Perceptual, build_perceptual, image_terms
 from train.trainer import learning_rate_factor
-from vestcl import interrupt
+from vestcl.cli import interrupt
 from vestcl.io import atomic
 from vestcl.models.checkpoint import read_trained_on, write_checkpoint
 from vestcl.models.config import ModelConfig, RefineConfig

@@ -15,11 +15,11 @@ from torch.utils.tensorboard import SummaryWriter
 from train.config import Config
 from train.data import Batch
 from train.trainer import Update
+from vestcl.cli.progress import Bar
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.atomic import write_bytes
 from vestcl.io.images import write_pixels
 from vestcl.models.forecaster import RenderedView
-from vestcl.progress import Bar
 
 LOG: Final = "log.jsonl"
 

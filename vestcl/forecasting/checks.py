@@ -4,11 +4,11 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from vestcl.cli.options import check_pixels
 from vestcl.data.street import input as street_input
-from vestcl.options import check_pixels
 
 if TYPE_CHECKING:
-    from vestcl import cli
+    from vestcl.cli import main as cli
     from vestcl.data.sample import Clip
 
 #: What an input is not, though it looks like one that vestcl could open.

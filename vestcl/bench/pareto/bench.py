@@ -18,10 +18,10 @@ from vestcl.bench.pareto.front import PRICE, front, knee
 from vestcl.bench.pareto.knobs import EXACT, Knob, Setting, combinations, describe, knobs
 from vestcl.bench.pareto.measure import Bench, measure, recursions
 from vestcl.bench.pareto.scenes import scene
+from vestcl.cli.progress import Bar
 from vestcl.models.inference import pretrained, quality
 from vestcl.models.inference.fast import accelerate
 from vestcl.opencl import session as runtime
-from vestcl.progress import Bar
 
 #: Horizons that the two ways of going on from t + 1 are compared at.
 HORIZONS: Final = (1, 3, 5)

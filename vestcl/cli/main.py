@@ -9,10 +9,10 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
-from vestcl import interrupt
+from vestcl.cli import interrupt
 
 if TYPE_CHECKING:
-    from vestcl.commands import Bench, Demo, Devices, Doctor, Forecast, Prepare
+    from vestcl.cli.commands import Bench, Demo, Devices, Doctor, Forecast, Prepare
 
 __all__ = ["Bench", "Demo", "Devices", "Doctor", "Forecast", "Prepare", "main"]
 
@@ -25,8 +25,8 @@ _BENCHES: Final = (
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
-        raise AttributeError(f"module 'vestcl.cli' has no attribute {name!r}")
-    return getattr(import_module("vestcl.commands"), name)
+        raise AttributeError(f"module 'vestcl.cli.main' has no attribute {name!r}")
+    return getattr(import_module("vestcl.cli.commands"), name)
 
 
 @interrupt.command
@@ -36,7 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: the command line; None takes the process's own.
     """
-    from vestcl import __version__, command_line
+    from vestcl import __version__
+    from vestcl.cli import command_line
 
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given == ["--version"]:
@@ -48,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parsed_command(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
     """The options, and what to call for them."""
-    from vestcl import command_line, commands
+    from vestcl.cli import command_line, commands
 
     kinds: dict[str, Callable[..., Any]] = {
         "forecast": commands.Forecast,
@@ -65,7 +66,7 @@ def _parsed_command(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
 
 def _parsed_bench(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
     """As `_parsed_command`, of the bench that is asked for: one that can't be imported must not stop the others."""
-    from vestcl import command_line
+    from vestcl.cli import command_line
 
     names = arguments[1:2]
     benches = _benches(sorted({*names} & {*_BENCHES}), asked=True) or _benches(_BENCHES, asked=False)
@@ -91,7 +92,7 @@ def _bench_of(name: str, asked: bool) -> tuple[ModuleType, type] | None:
             return None
         if asked or interrupt.is_interrupt(error):
             raise
-        from vestcl import command_line
+        from vestcl.cli import command_line
 
         command_line.print_error(f"bench {name} is left out: {error!r}", "yellow")
         return None

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
-from vestcl import interrupt, options
+from vestcl.cli import interrupt, options
 
 #: Exit status of an error that the user can correct.
 REFUSED: Final = 2

@@ -97,7 +97,7 @@ class Demo:
 
     def run(self) -> int:
         """Write the pictures."""
-        from vestcl import demo
+        from vestcl.cli import demo
         from vestcl.opencl import session as runtime
 
         with runtime.use(self.device):
@@ -194,7 +194,7 @@ class Forecast:
 
     def run(self) -> int:
         """Forecast and write."""
-        from vestcl import forecast_command
+        from vestcl.cli import forecast as forecast_command
 
         forecast_command.run(self)
         return 0
@@ -268,7 +268,7 @@ class Prepare:
 
     def run(self) -> int:
         """Fill the cache."""
-        from vestcl import prepare_command
+        from vestcl.cli import prepare as prepare_command
 
         prepare_command.run(self)
         return 0

@@ -13,19 +13,19 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from vestcl import interrupt
+from vestcl.cli import interrupt
+from vestcl.cli.forecast import open_clip
+from vestcl.cli.progress import Bar
 from vestcl.data.inputs import inputs_of
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
-from vestcl.forecast_command import open_clip
 from vestcl.forecasting.checks import check_file_options, is_network_file
 from vestcl.prepare.clip import Outcome, Report, prepare_clip
 from vestcl.prepare.workers import Task, Told, run_tasks
-from vestcl.progress import Bar
 from vestcl.scene.inpainting.inpainters import LAMA, inpainter
 
 if TYPE_CHECKING:
-    from vestcl import cli
+    from vestcl.cli import main as cli
 
 #: Where a data set's cache is without ``out``: in it, or for a file beside it.
 BESIDE: Final = ".vestcl"
@@ -131,12 +131,12 @@ def open_input(text: str, options: "cli.Prepare") -> Clip:
     """A clip as `vestcl forecast` opens it, or the street of "street:SEED", at the options' size.
 
     Raises:
-        ValueError: as `vestcl.forecast_command.open_clip`.
+        ValueError: as `vestcl.cli.forecast.open_clip`.
     """
     reader = {name: getattr(options, name) for name in _READER}
     street = street_input.parse(text)
     if street is None or street.seeds is None:
-        from vestcl import cli
+        from vestcl.cli import main as cli
 
         return open_clip(cli.Forecast(text, height=options.height, width=options.width, **reader))
     if wrong := [name for name, unset in _READER.items() if reader[name] != unset]:

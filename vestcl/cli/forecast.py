@@ -15,6 +15,8 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
+from vestcl.cli.options import check_pixels
+from vestcl.cli.progress import Bar
 from vestcl.data.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
@@ -30,12 +32,10 @@ from vestcl.forecasting.views import parse_views
 from vestcl.io import contact_sheet as sheet
 from vestcl.models.inference import pretrained, quality
 from vestcl.opencl import session as runtime
-from vestcl.options import check_pixels
-from vestcl.progress import Bar
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 
 if TYPE_CHECKING:
-    from vestcl import cli
+    from vestcl.cli import main as cli
     from vestcl.models.forecaster import Forecaster
 
 #: Frames of a street up to the current one where ``frame`` is not told, and its size in pixels: SPEC section 10.
