@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from forecaster_scenes import TINY
 
-from train.checkpoint import State, list_checkpoints
-from train.config import Config, from_dict, to_dict
+from train.run.checkpoint import State, list_checkpoints
+from train.settings.config import Config, from_dict, to_dict
 
 SETTINGS: dict[str, Any] = {
     "name": "tiny",

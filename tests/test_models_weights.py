@@ -13,7 +13,7 @@ from forecaster_scenes import TINY
 from safetensors.torch import save_file
 from torch import nn
 
-from train import checkpoint
+from train.run import checkpoint
 from vestcl.cli import main as cli
 from vestcl.evaluation.perceptual import Lpips, VggLoss
 from vestcl.evaluation.trunks.trunks import Trunk, load_trunk

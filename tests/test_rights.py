@@ -10,7 +10,8 @@ import torch
 from checkpoint_states import state_of
 from forecaster_scenes import TINY
 
-from train import checkpoint, export
+from train import export
+from train.run import checkpoint
 from vestcl import io
 from vestcl.data import Street
 from vestcl.io import depth, exr, images

@@ -90,8 +90,8 @@ def test_inputs_go_before_options() -> None:
 
 def test_evaluation_and_forecast_take_the_drive(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from train.evaluate import _where
-    from train.evaluate_options import Evaluation
-    from train.protocols import PROTOCOLS
+    from train.evaluation.options import Evaluation
+    from train.evaluation.protocols import PROTOCOLS
 
     config = Evaluation("street", seeds=(7, 7), drive="road", street_fps=25.0, height=HEIGHT, width=WIDTH)
     (source,) = PROTOCOLS["street"].sources(_where(config, PROTOCOLS["street"]))

@@ -1,4 +1,4 @@
-"""train.augment: pictures, cameras and motions change together."""
+"""train.data.augment: pictures, cameras and motions change together."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,8 +11,8 @@ from geometric_scenes import turned
 from numpy.typing import NDArray
 from test_network_input import HEIGHT, MOTIONS, WIDTH, prepared
 
-from train import augment
-from train.augment import Window
+from train.data import augment
+from train.data.augment import Window
 from vestcl import geometry, reference
 from vestcl.forecasting.network.input import last_motions, network_input
 from vestcl.models import EgoMotion, RigidMotion

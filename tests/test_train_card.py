@@ -1,4 +1,4 @@
-"""train.card: a card of a run that was made up, number by number."""
+"""train.card.__main__: a card of a run that was made up, number by number."""
 
 import dataclasses
 import hashlib
@@ -12,14 +12,17 @@ import pytest
 import yaml
 from forecaster_scenes import TINY
 
-from train import card, card_pictures, card_tables, checkpoint
-from train.card import Card, main, portable, thinned, write_card
-from train.card_pictures import draw_curves, smoothed, stages_of, write_sheet
-from train.config import from_dict, load_config, to_dict
-from train.evaluate_report import Results, as_json
-from train.evaluate_windows import CAMERA, CONSTANT_VELOCITY
-from train.protocols import PROTOCOLS
-from train.report import LOG
+from train.card import __main__ as card
+from train.card import pictures as card_pictures
+from train.card import tables as card_tables
+from train.card.__main__ import Card, main, portable, thinned, write_card
+from train.card.pictures import draw_curves, smoothed, stages_of, write_sheet
+from train.evaluation.protocols import PROTOCOLS
+from train.evaluation.report import Results, as_json
+from train.evaluation.windows import CAMERA, CONSTANT_VELOCITY
+from train.run import checkpoint
+from train.run.report import LOG
+from train.settings.config import from_dict, load_config, to_dict
 from vestcl.data import Street
 from vestcl.evaluation import GEOMETRIC, Record
 from vestcl.io.images import read_pixels, write_pixels

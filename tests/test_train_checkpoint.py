@@ -15,9 +15,9 @@ import torch
 from checkpoint_states import configured, state_of, steps
 from forecaster_scenes import TINY, camera, pair_of
 
-from train import checkpoint, hashes
-from train.checkpoint import CheckpointError, State, list_checkpoints, load_latest, restore_rng, rng_state, save
-from train.config import from_dict
+from train.run import checkpoint, hashes
+from train.run.checkpoint import CheckpointError, State, list_checkpoints, load_latest, restore_rng, rng_state, save
+from train.settings.config import from_dict
 from vestcl.models.forecaster import Forecaster
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from checkpoint_states import state_of, steps
 
-from train.checkpoint import load_latest, save
+from train.run.checkpoint import load_latest, save
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SAVES_FOREVER = """
 import itertools, sys, torch
 from forecaster_scenes import TINY
-from train.checkpoint import State, save
+from train.run.checkpoint import State, save
 for step in itertools.count(int(sys.argv[2])):
     weights = {"w": torch.full((1_000_000,), float(step))}
     print("begin", step, flush=True)
@@ -33,7 +33,7 @@ for step in itertools.count(int(sys.argv[2])):
 SAVES_TOO_MUCH = """
 import resource, sys, torch
 from forecaster_scenes import TINY
-from train.checkpoint import CheckpointError, State, save
+from train.run.checkpoint import CheckpointError, State, save
 resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
 def state(step, weights, moments):
     return State(step, {}, TINY, {"w": torch.zeros(weights)}, None, {"m": torch.zeros(moments)}, {})
@@ -50,7 +50,7 @@ except CheckpointError as error:
 DIES_EVERYWHERE = """
 import os, pathlib, shutil, signal, sys, torch
 from forecaster_scenes import TINY
-from train.checkpoint import State, _verified, list_checkpoints, load_latest, save
+from train.run.checkpoint import State, _verified, list_checkpoints, load_latest, save
 torch.set_num_threads(1)
 
 def state(step):

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from train.config import Config, DataConfig, Stage, from_dict, load_config, to_dict
+from train.settings.config import Config, DataConfig, Stage, from_dict, load_config, to_dict
 from vestcl.data.readers.splits import (
     CITYSCAPES_TRAIN_SNIPPETS,
     KITTI_PREDICTION_TEST,

@@ -1,4 +1,4 @@
-"""train.data: batches that follow from (seed, step, position) alone."""
+"""train.data.windows: batches that follow from (seed, step, position) alone."""
 
 import pickle
 import subprocess
@@ -14,7 +14,7 @@ from forecaster_scenes import change
 from test_network_input import MOTIONS, prepared
 from torch.nn import functional
 
-from train.data import Batch, Draw, WindowSet, loader
+from train.data.windows import Batch, Draw, WindowSet, loader
 from vestcl import geometry
 from vestcl.data import Street
 from vestcl.forecasting.network.input import last_motions, network_input
@@ -207,7 +207,7 @@ def test_reading_leaves_the_global_generators_alone(clips: list[PreparedClip]) -
 def test_reading_opens_no_device(cache: Path) -> None:
     code = (
         "import sys\n"
-        "from train.data import WindowSet, loader\n"
+        "from train.data.windows import WindowSet, loader\n"
         "from vestcl.prepare.prepared import find_prepared\n"
         "windows = WindowSet(find_prepared(sys.argv[1]), crop=(24, 80), flip=True, colour=0.5, right=0.5)\n"
         "assert len(list(loader(windows, 0, 2, range(2)))) == 2\n"

@@ -1,4 +1,4 @@
-"""train.data: what is refused, and how it is said."""
+"""train.data.windows: what is refused, and how it is said."""
 
 from pathlib import Path
 from typing import Any, cast
@@ -6,7 +6,7 @@ from typing import Any, cast
 import pytest
 from test_train_data import HEIGHT, WIDTH, FakeClip, fakes
 
-from train.data import Draw, WindowSet, loader
+from train.data.windows import Draw, WindowSet, loader
 from vestcl.data import Street
 from vestcl.prepare.clip import prepare_clip
 from vestcl.prepare.prepared import PreparedClip, find_prepared

@@ -1,4 +1,4 @@
-"""train.data: the camera's true way, to every horizon."""
+"""train.data.windows: the camera's true way, to every horizon."""
 
 import itertools
 from typing import Any, cast
@@ -8,7 +8,7 @@ from geometric_scenes import turned
 from numpy.typing import NDArray
 from test_train_data import FakeClip
 
-from train.data import Draw, WindowSet
+from train.data.windows import Draw, WindowSet
 from vestcl.prepare.prepared import PreparedClip
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from train import degrade
-from train.config import DataConfig, DegradeConfig
-from train.data import WindowSet
-from train.degrade import Degradation
+from train.data import degrade
+from train.data.degrade import Degradation
+from train.data.windows import WindowSet
 from train.fit import window_set
+from train.settings.config import DataConfig, DegradeConfig
 from vestcl.data.street import input as street_input
 from vestcl.prepare.clip import prepare_clip
 from vestcl.prepare.prepared import PreparedClip, find_prepared

@@ -12,12 +12,13 @@ from forecaster_scenes import SMALL, TINY, stir
 from kitti_trees import SIZE, drives
 from st_lpips_weights import public_state
 
-from train import evaluate, evaluate_windows
+from train import evaluate
 from train.evaluate import Evaluation, main
-from train.evaluate_inputs import PAIR
-from train.evaluate_leaks import training_overlap
-from train.evaluate_windows import AS_SEEN, CAMERA, CONSTANT_VELOCITY, PART_WINDOWS
-from train.protocols import NOW, Source
+from train.evaluation import windows as evaluate_windows
+from train.evaluation.inputs import PAIR
+from train.evaluation.leaks import training_overlap
+from train.evaluation.protocols import NOW, Source
+from train.evaluation.windows import AS_SEEN, CAMERA, CONSTANT_VELOCITY, PART_WINDOWS
 from vestcl.data import Street
 from vestcl.data.readers.splits import (
     KITTI_PREDICTION_TEST,

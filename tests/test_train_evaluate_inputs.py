@@ -1,4 +1,4 @@
-"""train.evaluate_inputs: where depth comes from, and what no forecast may see."""
+"""train.evaluation.inputs: where depth comes from, and what no forecast may see."""
 
 import dataclasses
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 import torch
 from forecaster_scenes import TINY, stir
 
-from train.evaluate_inputs import (
+from train.evaluation.inputs import (
     PAIR,
     Preprocessing,
     check_stereo,
@@ -19,9 +19,9 @@ from train.evaluate_inputs import (
     plain,
     sentences,
 )
-from train.evaluate_setup import Setup
-from train.evaluate_windows import forecast, inputs_of, perceptions_of, prepared, presenters, views_of, window
-from train.protocols import NOW, NOW_BORDER, PROTOCOLS, Name
+from train.evaluation.protocols import NOW, NOW_BORDER, PROTOCOLS, Name
+from train.evaluation.setup import Setup
+from train.evaluation.windows import forecast, inputs_of, perceptions_of, prepared, presenters, views_of, window
 from vestcl.cli.forecast import Estimators
 from vestcl.data import Street
 from vestcl.data.inputs import Inputs

@@ -13,8 +13,8 @@ from test_train_evaluate import run
 
 from train import evaluate
 from train.evaluate import main
-from train.evaluate_inputs import PAIR
-from train.evaluate_options import Evaluation
+from train.evaluation.inputs import PAIR
+from train.evaluation.options import Evaluation
 from vestcl.cli import main as cli
 from vestcl.data import Street
 from vestcl.data.readers.splits import KITTI_VIEWS_TEST

@@ -1,10 +1,10 @@
-"""train.evaluate_report: tables and files of numbers that were put in."""
+"""train.evaluation.report: tables and files of numbers that were put in."""
 
 import dataclasses
 
-from train.evaluate_report import Results, as_json, grids, headline, markdown, short_grids, table_of_windows
-from train.evaluate_windows import CAMERA, CONSTANT_VELOCITY
-from train.protocols import NOW, PROTOCOLS, Protocol
+from train.evaluation.protocols import NOW, PROTOCOLS, Protocol
+from train.evaluation.report import Results, as_json, grids, headline, markdown, short_grids, table_of_windows
+from train.evaluation.windows import CAMERA, CONSTANT_VELOCITY
 from vestcl.evaluation import GEOMETRIC, Grid, Record
 
 NAME = PROTOCOLS["kitti-space"].title

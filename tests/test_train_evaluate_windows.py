@@ -1,4 +1,4 @@
-"""train.evaluate_windows: what one window is given, and how it is scored."""
+"""train.evaluation.windows: what one window is given, and how it is scored."""
 
 import dataclasses
 from pathlib import Path
@@ -10,9 +10,9 @@ import torch
 from forecaster_scenes import TINY, stir
 from st_lpips_weights import public_state
 
-from train.evaluate_inputs import PAIR, known_of
-from train.evaluate_windows import CAMERA, Setup, forecast, perceptions_of, prepared, presenters, views_of, window
-from train.protocols import NOW, PROTOCOLS
+from train.evaluation.inputs import PAIR, known_of
+from train.evaluation.protocols import NOW, PROTOCOLS
+from train.evaluation.windows import CAMERA, Setup, forecast, perceptions_of, prepared, presenters, views_of, window
 from vestcl.data import Street
 from vestcl.data.sample import Clip
 from vestcl.evaluation import GEOMETRIC, SOURCE, Truth, metrics

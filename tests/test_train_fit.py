@@ -12,11 +12,12 @@ import pytest
 import torch
 from train_scenes import MODELS, Processes, configured, steps, street, write_yaml
 
-from train import checkpoint, export, fit, losses, trainer
-from train.checkpoint import CheckpointError
-from train.config import DataConfig
+from train import export, fit
 from train.fit import STOPPED, TrainingError
-from train.report import LOG, Reporter, read_log
+from train.run import checkpoint, losses, trainer
+from train.run.checkpoint import CheckpointError
+from train.run.report import LOG, Reporter, read_log
+from train.settings.config import DataConfig
 from vestcl.data import Street
 from vestcl.data.readers.splits import KITTI_VIEWS_TEST, KITTI_VIEWS_TRAIN
 from vestcl.models import ObjectMotion, config

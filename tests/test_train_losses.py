@@ -10,9 +10,9 @@ import torch
 from data_files import real
 from forecaster_scenes import OBJECTS, SMALL, TINY, camera, pair_of, stir, turning
 
-from train.config import LossConfig
-from train.data import Batch
-from train.losses import NEAREST, build_perceptual, path_errors, pose_errors, residual_motion, ssim_loss, total_loss
+from train.data.windows import Batch
+from train.run.losses import NEAREST, build_perceptual, path_errors, pose_errors, residual_motion, ssim_loss, total_loss
+from train.settings.config import LossConfig
 from vestcl import geometry
 from vestcl.evaluation import metrics
 from vestcl.evaluation.perceptual import VggLoss

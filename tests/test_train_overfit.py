@@ -7,10 +7,10 @@ import pytest
 import torch
 from train_scenes import configured
 
-from train.data import Batch, loader
+from train.data.windows import Batch, loader
 from train.fit import window_set
-from train.ranks import Ranks
-from train.trainer import Trainer, build_model
+from train.run.ranks import Ranks
+from train.run.trainer import Trainer, build_model
 from vestcl.data import Street
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare.clip import prepare_clip

@@ -11,7 +11,7 @@ import yaml
 from train_scenes import street
 
 from train import peer
-from train.data import Batch
+from train.data.windows import Batch
 from train.fit import window_set
 from train.peer import LOG, STATE, WEIGHTS, PeerConfig, load_config, loss_of, pyramid_loss, train
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork

@@ -1,4 +1,4 @@
-"""train.data: the camera's forecast path and the time between frames reach the model, in batches of several rates."""
+"""train.data.windows: the camera's forecast path and the time between frames reach the model, in batches of several rates."""
 
 import dataclasses
 from pathlib import Path
@@ -15,11 +15,12 @@ from test_train_data import FakeClip
 from torch import nn
 from train_scenes import MODELS, configured, street
 
-from train import augment, card_tables
-from train.data import Draw, WindowSet, loader
+from train.card import tables as card_tables
+from train.data import augment
+from train.data.windows import Draw, WindowSet, loader
 from train.fit import window_set, with_intervals
-from train.ranks import Ranks
-from train.trainer import Trainer, build_model
+from train.run.ranks import Ranks
+from train.run.trainer import Trainer, build_model
 from vestcl import geometry
 from vestcl.data.inputs import Inputs
 from vestcl.forecasting.network.input import camera_path, last_motions, network_input

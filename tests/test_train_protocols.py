@@ -1,4 +1,4 @@
-"""train.protocols: windows by hand, and window counts on trees in the data sets' own layouts."""
+"""train.evaluation.protocols: windows by hand, and window counts on trees in the data sets' own layouts."""
 
 import json
 from collections.abc import Mapping
@@ -8,8 +8,8 @@ import pytest
 from data_files import picture
 from kitti_trees import calibration
 
-from train.evaluate_windows import PART_WINDOWS, Part, plan
-from train.protocols import HELD_OUT, NOW, PROTOCOLS, Name, Where, currents
+from train.evaluation.protocols import HELD_OUT, NOW, PROTOCOLS, Name, Where, currents
+from train.evaluation.windows import PART_WINDOWS, Part, plan
 from vestcl.bench.forecast.bench import HELD_OUT as BENCH_HELD_OUT
 from vestcl.data.readers.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL, windows
 from vestcl.evaluation import METRICS

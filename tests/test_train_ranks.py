@@ -1,4 +1,4 @@
-"""train.ranks: processes that share a batch come to one process's weights, and go on after one of them is lost."""
+"""train.run.ranks: processes that share a batch come to one process's weights, and go on after one of them is lost."""
 
 import os
 import signal
@@ -15,9 +15,9 @@ from train_scenes import MODELS, MOMENT, ROOT, configured, steps, street, weight
 
 from train import fit
 from train.fit import TrainingError
-from train.ranks import LostProcessError, Ranks, lost_processes_named
-from train.report import LOG, read_log
-from train.trainer import build_model
+from train.run.ranks import LostProcessError, Ranks, lost_processes_named
+from train.run.report import LOG, read_log
+from train.run.trainer import build_model
 from vestcl.models import config
 from vestcl.opencl import session as runtime
 

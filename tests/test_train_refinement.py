@@ -11,9 +11,10 @@ import torch
 import yaml
 from forecaster_scenes import SMALL
 
-from train import forecasts, refinement, refinement_scores, trainer
+from train import forecasts, refinement, refinement_scores
 from train.forecasts import Entry, Window, pack, unpack
 from train.refinement import LOG, STATE, RefinementConfig, Samples, load_config, train, with_forecast_refinement
+from train.run import trainer
 from vestcl.cli.prepare import open_input
 from vestcl.data import Street
 from vestcl.forecasting.geometric import Perception, forecast_frames

@@ -1,4 +1,4 @@
-"""train.report: the log, TensorBoard's files and images, and what a resumed run makes of them."""
+"""train.run.report: the log, TensorBoard's files and images, and what a resumed run makes of them."""
 
 import errno
 import json
@@ -16,10 +16,10 @@ from rich.console import Console
 from tensorboard.backend.event_processing import event_accumulator  # type: ignore[import-untyped]
 from train_scenes import MODELS, configured
 
-from train.config import Config
-from train.data import Batch
-from train.report import LOG, Reporter, read_log, training_sheet
-from train.trainer import Update
+from train.data.windows import Batch
+from train.run.report import LOG, Reporter, read_log, training_sheet
+from train.run.trainer import Update
+from train.settings.config import Config
 from vestcl.models import config
 from vestcl.models.forecaster import RenderedView
 
@@ -164,7 +164,7 @@ def test_a_full_disk_costs_curves_and_no_run(tmp_path: Path, monkeypatch: pytest
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("train.report.write_pixels", full)
+    monkeypatch.setattr("train.run.report.write_pixels", full)
     printed = report(tmp_path / "out", [1.0] * 8)
     assert printed.count("can't be written") == 1 and "No space left" in printed
     assert [row["step"] for row in read_log(tmp_path / "out" / LOG)] == [2, 4, 6, 8]

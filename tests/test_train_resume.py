@@ -8,8 +8,8 @@ import pytest
 import torch
 from checkpoint_states import SETTINGS, configured, state_of
 
-from train import checkpoint
-from train.resume import check_resume
+from train.run import checkpoint
+from train.run.resume import check_resume
 
 
 def test_what_may_change_on_the_way() -> None:

@@ -1,4 +1,4 @@
-"""train.trainer: one stage's updates, by hand where they can be."""
+"""train.run.trainer: one stage's updates, by hand where they can be."""
 
 import copy
 import dataclasses
@@ -13,12 +13,12 @@ from test_encoder import resnet34
 from torch import nn
 from train_scenes import MODELS, configured, street
 
-from train import losses, trainer
-from train.config import Config, Stage
-from train.data import Batch, loader
+from train.data.windows import Batch, loader
 from train.fit import window_set
-from train.ranks import Ranks
-from train.trainer import Average, NotANumberError, Trainer, build_model, choose_parts, learning_rate_factor
+from train.run import losses, trainer
+from train.run.ranks import Ranks
+from train.run.trainer import Average, NotANumberError, Trainer, build_model, choose_parts, learning_rate_factor
+from train.settings.config import Config, Stage
 from vestcl.models import Encoder, ObjectMotion, config, load_resnet34
 from vestcl.models.config import RoutingConfig
 from vestcl.models.forecaster import Forecaster

@@ -11,7 +11,7 @@ from geometric_scenes import HEIGHT, WIDTH, decibels, turned
 from test_network_input import MOTIONS, displaced, prepared
 from video_files import write_video
 
-from train.data import WindowSet
+from train.data.windows import WindowSet
 from vestcl.bench.forecast import bench
 from vestcl.bench.forecast import run as running
 from vestcl.cli import main as cli

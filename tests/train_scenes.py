@@ -16,9 +16,10 @@ import torch
 import yaml
 from forecaster_scenes import SMALL, TINY
 
-from train import checkpoint, fit
-from train.config import Config, from_dict
-from train.report import Reporter
+from train import fit
+from train.run import checkpoint
+from train.run.report import Reporter
+from train.settings.config import Config, from_dict
 from vestcl.data import Street
 from vestcl.models import config
 from vestcl.prepare.clip import prepare_clip

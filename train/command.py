@@ -10,8 +10,8 @@ from typing import Any, Final, TextIO
 from rich.console import Console
 from rich.text import Text
 
-from train.checkpoint import CheckpointError
-from train.ranks import LostProcessError
+from train.run.checkpoint import CheckpointError
+from train.run.ranks import LostProcessError
 from vestcl.opencl import session as runtime
 
 #: Exit status of a command that could not do what it was asked for.

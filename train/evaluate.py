@@ -3,7 +3,7 @@
 Next to each model there are: the last frame repeated, optical flow at constant velocity, and the geometric forecast,
 which needs no weights. All get the same frames at the same size, and models the geometric forecast's depth and masks;
 every table names where these come from.
-`train.protocols` says what is evaluated, `train.evaluate_windows` how one window is, `train.evaluate_report` what
+`train.evaluation.protocols` says what is evaluated, `train.evaluation.windows` how one window is, `train.evaluation.report` what
 comes out.
 
 A killed evaluation goes on where it was: what is done lies in OUT/clips, by settings, models and vestcl's version (not
@@ -22,17 +22,17 @@ from typing import Any, Final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from train import evaluate_report as report
 from train.command import ERRORS, failed
-from train.evaluate_inputs import Preprocessing, check_prepared, check_stereo, plain
-from train.evaluate_key import about_run, key_of
-from train.evaluate_leaks import training_overlap
-from train.evaluate_options import Evaluation, check_options
-from train.evaluate_setup import Setup
-from train.evaluate_sheets import write_sheets
-from train.evaluate_windows import Part, plan, read_inputs, read_part, run_part
-from train.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
-from train.ranks import Ranks, local_rank
+from train.evaluation import report
+from train.evaluation.inputs import Preprocessing, check_prepared, check_stereo, plain
+from train.evaluation.key import about_run, key_of
+from train.evaluation.leaks import training_overlap
+from train.evaluation.options import Evaluation, check_options
+from train.evaluation.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
+from train.evaluation.setup import Setup
+from train.evaluation.sheets import write_sheets
+from train.evaluation.windows import Part, plan, read_inputs, read_part, run_part
+from train.run.ranks import Ranks, local_rank
 from vestcl import __version__
 from vestcl.bench.common import results as _results
 from vestcl.cli import command_line, interrupt, options

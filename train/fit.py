@@ -20,15 +20,15 @@ import torch
 import tyro
 from rich.console import Console
 
-from train import checkpoint, resume
-from train.checkpoint import CheckpointError, State
 from train.command import ERRORS, failed, lost_worker, warnings_in_lines
-from train.config import Config, DataConfig, load_config, to_dict
-from train.data import WindowSet, loader
-from train.losses import build_perceptual
-from train.ranks import Ranks, lost_processes_named
-from train.report import Reporter
-from train.trainer import Average, NotANumberError, Trainer, build_model
+from train.data.windows import WindowSet, loader
+from train.run import checkpoint, resume
+from train.run.checkpoint import CheckpointError, State
+from train.run.losses import build_perceptual
+from train.run.ranks import Ranks, lost_processes_named
+from train.run.report import Reporter
+from train.run.trainer import Average, NotANumberError, Trainer, build_model
+from train.settings.config import Config, DataConfig, load_config, to_dict
 from vestcl.cli import command_line, interrupt
 from vestcl.data.readers.splits import KITTI_TRAINING
 from vestcl.models.checkpoint import Frames, read_trained_on

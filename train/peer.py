@@ -23,12 +23,21 @@ from torch import nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from train._settings import in_words, read_settings
-from train.config import RULES, CountOrNone, DataConfig, LossConfig, OptimiserConfig, RunConfig, Stage, with_stage_parts
-from train.data import Batch, loader
+from train.data.windows import Batch, loader
 from train.fit import window_set
-from train.losses import Perceptual, build_perceptual, image_terms
-from train.trainer import learning_rate_factor
+from train.run.losses import Perceptual, build_perceptual, image_terms
+from train.run.trainer import learning_rate_factor
+from train.settings.config import (
+    RULES,
+    CountOrNone,
+    DataConfig,
+    LossConfig,
+    OptimiserConfig,
+    RunConfig,
+    Stage,
+    with_stage_parts,
+)
+from train.settings.yaml_files import in_words, read_settings
 from vestcl.io import atomic
 from vestcl.models.networks.voxel_flow import MULTIPLE, VoxelFlowNetwork
 
@@ -82,7 +91,7 @@ class PeerConfig:
 
 
 def load_config(path: Path | str, overrides: Sequence[str] = ()) -> PeerConfig:
-    """As `train.config.load_config`, for the peer.
+    """As `train.settings.config.load_config`, for the peer.
 
     Raises:
         FileNotFoundError: no such file.

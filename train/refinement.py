@@ -23,13 +23,13 @@ from rich.console import Console
 from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from train._settings import in_words, read_settings
-from train.augment import draw_colour, mean_luma
 from train.command import ERRORS, failed
-from train.config import RULES, Count, CountOrNone, LossConfig, OptimiserConfig, RunConfig, Share, Stage
+from train.data.augment import draw_colour, mean_luma
 from train.forecasts import unpack
-from train.losses import Perceptual, build_perceptual, image_terms
-from train.trainer import learning_rate_factor
+from train.run.losses import Perceptual, build_perceptual, image_terms
+from train.run.trainer import learning_rate_factor
+from train.settings.config import RULES, Count, CountOrNone, LossConfig, OptimiserConfig, RunConfig, Share, Stage
+from train.settings.yaml_files import in_words, read_settings
 from vestcl.cli import interrupt
 from vestcl.io import atomic
 from vestcl.models.checkpoint import read_trained_on, write_checkpoint
@@ -89,7 +89,7 @@ class RefinementConfig:
 
 
 def load_config(path: Path | str, overrides: Sequence[str] = ()) -> RefinementConfig:
-    """As `train.config.load_config`, for a refinement.
+    """As `train.settings.config.load_config`, for a refinement.
 
     Raises:
         FileNotFoundError: no such file.

@@ -6,9 +6,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
-from train.evaluate_inputs import label_of, plain, sentences
-from train.evaluate_windows import CONSTANT_VELOCITY
-from train.protocols import PAPER_NOTE, Protocol
+from train.evaluation.inputs import label_of, plain, sentences
+from train.evaluation.protocols import PAPER_NOTE, Protocol
+from train.evaluation.windows import CONSTANT_VELOCITY
 from vestcl.data.inputs import Inputs
 from vestcl.evaluation import (
     GEOMETRIC,

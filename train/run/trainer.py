@@ -10,10 +10,10 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from train.config import Config, Stage
-from train.data import Batch
-from train.losses import Perceptual, total_loss
-from train.ranks import Ranks
+from train.data.windows import Batch
+from train.run.losses import Perceptual, total_loss
+from train.run.ranks import Ranks
+from train.settings.config import Config, Stage
 from vestcl.models.config import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster, RenderedView, Step
 from vestcl.models.networks.encoder import load_resnet34
@@ -120,7 +120,7 @@ class Trainer:
         config: of the run.
         stage: of ``config``; its parts learn, all others are frozen.
         model: in training mode.
-        perceptual: from `train.losses.build_perceptual` of the stage's loss.
+        perceptual: from `train.run.losses.build_perceptual` of the stage's loss.
         ranks: the processes that share each batch; gradients are means over them.
     """
 

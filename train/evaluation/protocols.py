@@ -11,7 +11,7 @@
 | clip | any sequence | every one | source and right, t+1 ... t+5 |
 
 In kitti-space the right camera's image at t is the answer, so no depth may be matched against it
-(`train.evaluate_inputs`). The paper's SSIM has several scales; for that one view it follows VEST-MPI (`NOW_NOTE`).
+(`train.evaluation.inputs`). The paper's SSIM has several scales; for that one view it follows VEST-MPI (`NOW_NOTE`).
 
 Source: SPEC section 10. Where a two-frame method stands in a window of 4 + 5 it takes frames 2 and 3, counted from 0.
 """

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from train.evaluate_inputs import label_of, plain
-from train.evaluate_setup import Setup
-from train.evaluate_windows import forecast, perceptions_of, prepared, views_of
-from train.protocols import Source
+from train.evaluation.inputs import label_of, plain
+from train.evaluation.protocols import Source
+from train.evaluation.setup import Setup
+from train.evaluation.windows import forecast, perceptions_of, prepared, views_of
 from vestcl.evaluation import GEOMETRIC, METRICS, Record, Truth
 from vestcl.evaluation.statistics import extremes
 from vestcl.io import contact_sheet as sheet

@@ -4,8 +4,8 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from train.evaluate_inputs import Preprocessing
-from train.protocols import Protocol
+from train.evaluation.inputs import Preprocessing
+from train.evaluation.protocols import Protocol
 from vestcl.data.later_frames import LaterFrames, Perceived, later_frames
 from vestcl.evaluation.perceptual import Lpips, StLpips
 from vestcl.evaluation.trunks.trunks import Trunk
@@ -27,7 +27,7 @@ class Setup:
     mode: Mode | None = None
     """How models make steps after the first; None is each one's default."""
     stereo: bool = False
-    """Depth from the stereo pair although the clip has depth, see `train.evaluate_inputs.depths`."""
+    """Depth from the stereo pair although the clip has depth, see `train.evaluation.inputs.depths`."""
     trunk: Trunk | None = None
     """SqueezeNet 1.0."""
     lpips: Lpips | None = None

@@ -5,8 +5,8 @@ import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from train.checkpoint import State, package_versions
-from train.config import Config, from_dict, to_dict
+from train.run.checkpoint import State, package_versions
+from train.settings.config import Config, from_dict, to_dict
 
 #: Keys that may change on the way: none of them is a part of what was learnt so far.
 _FREE: Final = re.compile(r"((run|out|data\.workers|stages\.\d+\.data\.workers)(\.|$))")

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from train.evaluate_windows import Part
+from train.evaluation.windows import Part
 from vestcl.models.checkpoint import read_trained_on
 
 Sentences = tuple[str, ...]

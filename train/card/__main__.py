@@ -18,15 +18,16 @@ from typing import Any, Final
 import tyro
 import yaml
 
-from train import card_pictures, checkpoint
-from train.card_pictures import Rows
-from train.card_tables import Weights, about_model, data_table, prepare_commands, result_tables, training_table
-from train.checkpoint import State
+from train.card import pictures as card_pictures
+from train.card.pictures import Rows
+from train.card.tables import Weights, about_model, data_table, prepare_commands, result_tables, training_table
 from train.command import ERRORS, failed, warnings_in_lines
-from train.config import Config, from_dict
-from train.evaluate_options import Evaluation
-from train.protocols import PROTOCOLS
-from train.report import LOG, read_log
+from train.evaluation.options import Evaluation
+from train.evaluation.protocols import PROTOCOLS
+from train.run import checkpoint
+from train.run.checkpoint import State
+from train.run.report import LOG, read_log
+from train.settings.config import Config, from_dict
 from vestcl.cli import command_line, interrupt
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.checkpoint import read_checkpoint

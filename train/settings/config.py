@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 from pydantic import ConfigDict, Field, Strict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from train._settings import in_words, merged, read_settings
+from train.settings.yaml_files import in_words, merged, read_settings
 from vestcl.models import configuration
 
 Part = Literal["encoder", "ego_motion", "object_motion", "refine"]
@@ -32,7 +32,7 @@ class DegradeConfig:
     """How images are degraded as cameras do it, by random numbers of the run's seed; 0 leaves a kind out.
 
     Targets have the blur and the grey of the camera and the exposure of frame t, but no noise and no JPEG: see
-    `train.degrade`.
+    `train.data.degrade`.
     """
 
     share: Share = 0.5
@@ -136,7 +136,7 @@ class PoseConfig:
 
 @dataclass(frozen=True, config=RULES)
 class LossConfig:
-    """Weights of the loss's terms (`train.losses.total_loss`); 0 leaves a term out."""
+    """Weights of the loss's terms (`train.run.losses.total_loss`); 0 leaves a term out."""
 
     perceptual: PerceptualConfig
     l1: Weight = 1.0

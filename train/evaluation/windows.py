@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from train.evaluate_inputs import label_of, perceptions, plain
-from train.evaluate_setup import Setup
-from train.protocols import NOW, NOW_BORDER, Protocol, Source, currents
+from train.evaluation.inputs import label_of, perceptions, plain
+from train.evaluation.protocols import NOW, NOW_BORDER, Protocol, Source, currents
+from train.evaluation.setup import Setup
 from vestcl.data.inputs import Inputs
 from vestcl.data.later_frames import LaterFrames
 from vestcl.data.sample import Clip
@@ -78,7 +78,7 @@ def plan(sources: Iterable[Source], protocol: Protocol, steps: int, every: int, 
 
     Args:
         sources: clips.
-        protocol: which windows, see `train.protocols.currents`.
+        protocol: which windows, see `train.evaluation.protocols.currents`.
         steps: frames that are forecast.
         every: 1 takes all.
         folder: of the parts' files.

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from train.augment import LUMA, Matrix, Window
-from train.config import DegradeConfig
+from train.data.augment import LUMA, Matrix, Window
+from train.settings.config import DegradeConfig
 from vestcl.prepare.prepared import Prepared
 
 Image = NDArray[np.float32]

@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
-from train import augment, degrade
-from train.augment import Window
-from train.config import DegradeConfig
+from train.data import augment, degrade
+from train.data.augment import Window
+from train.settings.config import DegradeConfig
 from vestcl.forecasting.network.input import PAST, CameraPath, NetworkInput, camera_path, last_motions, network_input
 from vestcl.models.networks.layers import joined
 from vestcl.models.steps.prior import MotionPrior
@@ -99,7 +99,7 @@ class WindowSet:
     """First and last index, inclusive, of the frames that windows may show. What was measured in a frame may rest on
     the one before it."""
     degrade: DegradeConfig | None = None
-    """How images are degraded, see `train.degrade`; None leaves them as they are."""
+    """How images are degraded, see `train.data.degrade`; None leaves them as they are."""
     groups: tuple[int, ...] = ()
     """The group of each clip, from 0, where groups have weights."""
     weights: tuple[float, ...] = ()

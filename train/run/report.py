@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
-from train.config import Config
-from train.data import Batch
-from train.trainer import Update
+from train.data.windows import Batch
+from train.run.trainer import Update
+from train.settings.config import Config
 from vestcl.cli.progress import Bar
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.atomic import write_bytes

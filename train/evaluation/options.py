@@ -6,7 +6,7 @@ from typing import Literal
 
 import tyro
 
-from train.protocols import HELD_OUT, Name
+from train.evaluation.protocols import HELD_OUT, Name
 from vestcl.data.later_frames import Perceived
 from vestcl.evaluation.st_lpips import Option as StLpipsOption
 from vestcl.forecasting.network.learned import Learned

@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import Any, Final
 
-from train.evaluate_options import Evaluation
-from train.evaluate_windows import PART_WINDOWS
-from train.protocols import Protocol
+from train.evaluation.options import Evaluation
+from train.evaluation.protocols import Protocol
+from train.evaluation.windows import PART_WINDOWS
 from vestcl import __version__
 from vestcl.cli.prepare import identity
 from vestcl.evaluation import st_lpips

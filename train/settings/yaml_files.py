@@ -25,7 +25,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_settings(path: Path | str, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """The mapping that ``path`` holds, over its bases, under the overrides; see `train.config.load_config`.
+    """The mapping that ``path`` holds, over its bases, under the overrides; see `train.settings.config.load_config`.
 
     Args:
         path: a YAML file.

@@ -55,7 +55,7 @@ def draw_curves(path: Path, rows: Rows) -> None:
 
     Args:
         path: of the PNG.
-        rows: of the run's log, from `train.report.read_log`, one or more.
+        rows: of the run's log, from `train.run.report.read_log`, one or more.
     """
     figure = Figure(figsize=_INCHES, dpi=_DOTS, layout="constrained")
     axes = figure.subplots(3, 2).ravel()

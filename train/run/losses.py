@@ -12,8 +12,8 @@ from typing import Final
 import torch
 from torch.nn import functional
 
-from train.config import LossConfig
-from train.data import Batch
+from train.data.windows import Batch
+from train.settings.config import LossConfig
 from vestcl.evaluation import metrics
 from vestcl.evaluation.perceptual import VggLoss, squeeze_distance
 from vestcl.evaluation.trunks.trunks import load_trunk

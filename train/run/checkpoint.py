@@ -30,9 +30,9 @@ import torch
 from safetensors import SafetensorError
 
 import vestcl
-from train.hashes import known_sha256, sha256
-from train.rng import restore_rng as restore_rng
-from train.rng import rng_state
+from train.run.hashes import known_sha256, sha256
+from train.run.rng import restore_rng as restore_rng
+from train.run.rng import rng_state
 from vestcl.models.checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models.config import ModelConfig
 
@@ -73,7 +73,7 @@ class State:
     step: int
     """Updates done, in all stages; the data's position follows from it."""
     config: dict[str, Any]
-    """The run's, from `train.config.to_dict`."""
+    """The run's, from `train.settings.config.to_dict`."""
     model_config: ModelConfig
     model: Mapping[str, torch.Tensor]
     """Weights."""
@@ -89,7 +89,7 @@ class State:
     trained_on: dict[str, tuple[int, int]] = field(default_factory=dict)
     """By clip, the first and the last frame that was shown; the models' files have it, too."""
     recent: list[dict[str, float]] = field(default_factory=list)
-    """`train.report.Reporter.recent`: the next row of log.jsonl is a mean over these updates, too."""
+    """`train.run.report.Reporter.recent`: the next row of log.jsonl is a mean over these updates, too."""
 
 
 def list_checkpoints(out: Path | str) -> list[Path]:

@@ -11,10 +11,10 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from train.card_pictures import PARTS, Rows, stages_of
-from train.config import Config, DataConfig, LossConfig
-from train.evaluate_inputs import label_of, plain
+from train.card.pictures import PARTS, Rows, stages_of
+from train.evaluation.inputs import label_of, plain
 from train.fit import window_set
+from train.settings.config import Config, DataConfig, LossConfig
 from vestcl.data import Street
 from vestcl.evaluation import GEOMETRIC, METRICS, Grid, horizon, number, to_markdown
 from vestcl.models.config import ModelConfig
