@@ -1,4 +1,5 @@
-"""vestcl.data.readers.camera_file: what camera.json may not hold, and a short fuzz of it through the reader of folders."""
+"""vestcl.data.readers.camera_file: what camera.json may not hold, and a short fuzz of it through the reader of
+folders."""
 
 import json
 import os

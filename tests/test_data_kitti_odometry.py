@@ -1,4 +1,5 @@
-"""vestcl.data.readers.kitti_odometry on a tiny sequence in the data set's layout, and on a real one where that is there."""
+"""vestcl.data.readers.kitti_odometry on a tiny sequence in the data set's layout, and on a real one where that is
+there."""
 
 import itertools
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""vestcl.forecasting.geometric.memory: what earlier frames saw is bounded, and shown only where t and t-1 see nothing."""
+"""vestcl.forecasting.geometric.memory: what earlier frames saw is bounded, and shown only where t and t-1 see
+nothing."""
 
 import functools
 from collections.abc import Callable

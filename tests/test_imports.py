@@ -14,7 +14,8 @@ SOURCES = [*LIBRARY, *sorted((ROOT / "train").rglob("*.py"))]
 
 
 def imports(file: Path) -> Iterator[str]:
-    """Every module that ``file`` imports, anywhere in it; ``from vestcl import runtime`` gives vestcl.opencl.session."""
+    """Every module that ``file`` imports, anywhere in it; ``from vestcl import runtime`` gives
+    vestcl.opencl.session."""
     package = file.relative_to(ROOT).parts[:-1]
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):

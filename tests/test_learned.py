@@ -1,4 +1,5 @@
-"""vestcl.forecasting.network.learned and its backtest: a network corrects the geometric forecast by what would have improved it before."""
+"""vestcl.forecasting.network.learned and its backtest: a network corrects the geometric forecast by what would have
+improved it before."""
 
 import dataclasses
 import functools

@@ -1,4 +1,5 @@
-"""vestcl.evaluation.perceptual against plain re-computations on random weights, and the real SqueezeNet where it is at hand."""
+"""vestcl.evaluation.perceptual against plain re-computations on random weights, and the real SqueezeNet where it is at
+hand."""
 
 from collections.abc import Callable
 from copy import deepcopy

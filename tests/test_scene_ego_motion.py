@@ -1,4 +1,5 @@
-"""vestcl.scene.motion.ego_motion: from exact flow, among movers, on the street, and what follows from the last motions."""
+"""vestcl.scene.motion.ego_motion: from exact flow, among movers, on the street, and what follows from the last
+motions."""
 
 from typing import Any
 

@@ -1,4 +1,5 @@
-"""vestcl.models.inference.stage_times: stages timed without a change of the model, each thread's forecasts by themselves."""
+"""vestcl.models.inference.stage_times: stages timed without a change of the model, each thread's forecasts by
+themselves."""
 
 import copy
 import threading

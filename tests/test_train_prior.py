@@ -1,4 +1,5 @@
-"""train.data.windows: the camera's forecast path and the time between frames reach the model, in batches of several rates."""
+"""train.data.windows: the camera's forecast path and the time between frames reach the model, in batches of several
+rates."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""vestcl.evaluation.trunks.trunks: shapes and names of the public networks, plain re-computations, files good and bad."""
+"""vestcl.evaluation.trunks.trunks: shapes and names of the public networks, plain re-computations, files good and
+bad."""
 
 import json
 import struct

@@ -1,4 +1,5 @@
-"""vestcl.models.networks.voxel_flow: that the peer is the published network in size and shape, and computes what it should."""
+"""vestcl.models.networks.voxel_flow: that the peer is the published network in size and shape, and computes what it
+should."""
 
 from pathlib import Path
 

@@ -3,8 +3,8 @@
 Next to each model there are: the last frame repeated, optical flow at constant velocity, and the geometric forecast,
 which needs no weights. All get the same frames at the same size, and models the geometric forecast's depth and masks;
 every table names where these come from.
-`train.evaluation.protocols` says what is evaluated, `train.evaluation.windows` how one window is, `train.evaluation.report` what
-comes out.
+`train.evaluation.protocols` says what is evaluated, `train.evaluation.windows` how one window is,
+`train.evaluation.report` what comes out.
 
 A killed evaluation goes on where it was: what is done lies in OUT/clips, by settings, models and vestcl's version (not
 its code: delete the folder when that has changed). Several processes share the work with

@@ -1,8 +1,8 @@
 """Train the learned 2D peer: ``python -m train.peer train/configs/peer/dmvfn_street.yaml out=runs/dmvfn --resume``.
 
-A DMVFN-shaped network (`vestcl.models.networks.voxel_flow`, all blocks, no routing) learns to forecast the source camera's next
-frame from two, on the windows that `train.fit` trains on. Out come ``peer.safetensors``, the EMA weights that
-`train.evaluate --peer` and `vestcl bench forecast --peer` read, ``log.jsonl``, and ``state.pt`` to resume from.
+A DMVFN-shaped network (`vestcl.models.networks.voxel_flow`, all blocks, no routing) learns to forecast the source
+camera's next frame from two, on the windows that `train.fit` trains on. Out come ``peer.safetensors``, the EMA weights
+that `train.evaluate --peer` and `vestcl bench forecast --peer` read, ``log.jsonl``, and ``state.pt`` to resume from.
 """
 
 import dataclasses

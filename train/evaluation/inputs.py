@@ -3,7 +3,8 @@ seen the right camera are labelled.
 
 A stereo pair's depth at t is matched against the right camera's image at t. In a table of that camera's views it is an
 input that the paper does not have, so it makes rows of their own, whose names end with PAIR, next to the monocular
-ones. Where that very image is what is judged (`train.evaluation.protocols.Protocol.now`) it is refused. Depth that was matched
+ones. Where that very image is what is judged (`train.evaluation.protocols.Protocol.now`) it is refused. Depth that was
+matched
 elsewhere is no other: that of Cityscapes' disparity files, and that of clips that `vestcl prepare` matched.
 """
 

@@ -1,1 +1,1 @@
-"""TODO"""
+"""A training run: losses, optimiser steps, checkpoints, resuming, several processes, logs."""

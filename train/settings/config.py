@@ -78,7 +78,8 @@ class DataConfig:
     degrade: DegradeConfig | None = None
     """How images are degraded; null leaves them as they were prepared."""
     split: Literal["kitti-prediction", "kitti-views"] | None = None
-    """Show only the drives that this split of KITTI raw trains on (`vestcl.data.readers.splits`); null shows all clips."""
+    """Show only the drives that this split of KITTI raw trains on (`vestcl.data.readers.splits`); null shows all
+    clips."""
     workers: CountOrNone = 0
     """Processes that read next to the one that trains."""
 

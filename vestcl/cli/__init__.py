@@ -1,1 +1,1 @@
-"""TODO"""
+"""The command line: `main`, a file per command, and the options that commands share."""

@@ -72,8 +72,8 @@ def run(
         height: rows of the pictures.
         width: columns of the pictures.
         seed: of the street.
-        model: NETWORK or any other that `vestcl.models.inference.pretrained.load_model` knows, or GEOMETRIC; None is NETWORK where this
-            installation has it, else GEOMETRIC.
+        model: NETWORK or any other that `vestcl.models.inference.pretrained.load_model` knows, or GEOMETRIC; None is
+            NETWORK where this installation has it, else GEOMETRIC.
         level: how exactly the network computes.
         steps: frames to forecast.
 

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Bench", "Demo", "Devices", "Doctor", "Forecast", "Prepare", "main"]
 
-#: `vestcl bench train-step` is vestcl.bench.network.train_step; its ``main`` takes a TrainStepBench, may return an exit code.
+#: `vestcl bench train-step` is vestcl.bench.network.train_step; its ``main`` takes a TrainStepBench, may return an exit
+#: code.
 _BENCHES: Final = (
     *("splat", "operators", "pipeline", "train-step", "network"),
     *("pareto", "stability", "inpaint", "camera", "depth", "forecast", "compare"),

@@ -1,8 +1,8 @@
 """Distances between images in the features of a classifier: LPIPS, ST-LPIPS, one without heads, and a training loss.
 
 Each takes two images [B, 3, H, W] in [0, 1], RGB, and answers with [B]; 0 for equal images. All are differentiable in
-both images; the classifiers' weights (vestcl.evaluation.trunks.trunks) come from files and stay as they are. As metrics they
-are meant for 8-bit images: `vestcl.evaluation.metrics.quantise` them first.
+both images; the classifiers' weights (vestcl.evaluation.trunks.trunks) come from files and stay as they are. As metrics
+they are meant for 8-bit images: `vestcl.evaluation.metrics.quantise` them first.
 """
 
 from collections.abc import Sequence

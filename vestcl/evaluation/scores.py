@@ -306,7 +306,8 @@ def _scores(looks: Sequence[Look], wanted: Look, seen: torch.Tensor, truth: Trut
 def distance(
     maps: Sequence[torch.Tensor], wanted: Sequence[torch.Tensor], heads: Sequence[torch.Tensor] | None = None
 ) -> torch.Tensor:
-    """`vestcl.evaluation.perceptual.squeeze_distance`, or with ``heads`` `Lpips` or `StLpips`, of maps that are there: [1].
+    """`vestcl.evaluation.perceptual.squeeze_distance`, or with ``heads`` `Lpips` or `StLpips`, of maps that are there:
+    [1].
 
     Args:
         maps: [1, C_l, h_l, w_l] a layer.

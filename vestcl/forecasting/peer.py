@@ -68,7 +68,8 @@ def forecast_frames(
     """The frames after ``index``: from the source camera as the network forecasts them, from others by their geometry.
 
     To be seen from another camera, frame t+k gets the depth that the geometric forecast has at t+k; from there it is a
-    frame as any other (masks from motion, inpainted layers, points splatted: `vestcl.forecasting.geometric.show_frame`).
+    frame as any other (masks from motion, inpainted layers, points splatted:
+    `vestcl.forecasting.geometric.show_frame`).
 
     Args:
         perception: of the clip; other cameras need its depth and motion, the source camera only its images.

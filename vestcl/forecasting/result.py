@@ -86,4 +86,5 @@ class Forecast:
     mode: str | None = None
     """How a network made the steps after the first, "compose" or "feedback"; None of others."""
     learned: dict[str, LearnedPart] = field(default_factory=dict)
-    """By part of a network that was to be tested (`vestcl.forecasting.network.backtest`): "camera", "objects", "refinement"."""
+    """By part of a network that was to be tested (`vestcl.forecasting.network.backtest`): "camera", "objects",
+    "refinement"."""

@@ -198,7 +198,8 @@ class RefineConfig:
     covers, filled from what surrounds it. "none" paints the image through a sigmoid."""
     refines: Literal["clouds", "forecast"] = "clouds"
     """"clouds": the splatted clouds, features among them. "forecast": planes of a geometric forecast
-    (`vestcl.forecasting.network.planes`), whose image it adds to; the network's own forecast is then its base, unrefined."""
+    (`vestcl.forecasting.network.planes`), whose image it adds to; the network's own forecast is then its base,
+    unrefined."""
 
     def __post_init__(self) -> None:
         if self.base not in ("none", "splatted", "filled"):

@@ -56,7 +56,8 @@ class Stages(nn.Module):
         #: Encoder and refinement compute in this type (torch.bfloat16, or None for the parameters' own): motion, which
         #: is millimetres in hundreds of metres, never does.
         self.autocast: torch.dtype | None = None
-        #: What is not computed where a scene does not need it; `vestcl.models.inference.skipping.count_skips` counts it.
+        #: What is not computed where a scene does not need it; `vestcl.models.inference.skipping.count_skips` counts
+        #: it.
         self.skip = Skip()
         #: What is computed more coarsely than the network was trained to.
         self.effort = Effort()

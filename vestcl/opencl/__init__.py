@@ -1,1 +1,1 @@
-"""TODO"""
+"""Devices, programs, sessions and host memory: the only importer of pyopencl."""

@@ -1,1 +1,1 @@
-"""TODO"""
+"""What is computed once per clip and kept in files: `vestcl prepare`."""

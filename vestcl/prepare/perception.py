@@ -99,7 +99,8 @@ def _right(prepared: PreparedClip, index: int) -> RightCamera | None:
 class PreparedPerception(Perception):
     """What `vestcl prepare` computed of a clip; flow, and each point's velocity from it, are computed here.
 
-    Its clip has no right camera: whatever is computed from its frames, by `vestcl.forecasting.peer` for one, has their depth.
+    Its clip has no right camera: whatever is computed from its frames, by `vestcl.forecasting.peer` for one, has their
+    depth.
 
     Args:
         clip: of `as_clip`, at its own size.

@@ -108,8 +108,8 @@ class Perception:
     Args:
         clip: at its own size.
         progress: called with the stage that begins.
-        inpaint: how the background behind the foreground is filled, as `vestcl.scene.inpainting.inpaint.inpaint_background` takes
-            it; None is its default.
+        inpaint: how the background behind the foreground is filled, as
+            `vestcl.scene.inpainting.inpaint.inpaint_background` takes it; None is its default.
 
     Raises:
         ValueError: no such method of inpainting.

@@ -1,1 +1,1 @@
-"""TODO"""
+"""What benches share: timing, results as JSON, comparison of two results, plots."""

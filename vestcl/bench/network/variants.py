@@ -1,6 +1,7 @@
 """What makes the networks faster on a CPU, and what does not: a section of `vestcl bench network`.
 
-Every choice of `vestcl.models.inference.fast` is timed in turns with the plain network, on the same input, and so are those that
+Every choice of `vestcl.models.inference.fast` is timed in turns with the plain network, on the same input, and so are
+those that
 were left out there because they do not pay: weights in channels-last order, both frames in one pass of the encoder, and
 torch.compile (Inductor with the machine's C++ compiler, weights frozen), which has to compile first.
 """

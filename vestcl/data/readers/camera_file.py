@@ -1,4 +1,5 @@
-"""camera.json: the camera of a folder's frames, read strictly. What it may hold is listed in vestcl/data/readers/folder.py."""
+"""camera.json: the camera of a folder's frames, read strictly. What it may hold is listed in
+vestcl/data/readers/folder.py."""
 
 import difflib
 from collections.abc import Mapping

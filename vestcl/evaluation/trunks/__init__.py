@@ -1,1 +1,1 @@
-"""TODO"""
+"""Convolutional networks whose features perceptual distances compare."""

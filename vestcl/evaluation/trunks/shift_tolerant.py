@@ -1,4 +1,5 @@
-"""The shift-tolerant AlexNet of ST-LPIPS: what `vestcl.evaluation.trunks.trunks` is to LPIPS, with anti-aliased strides.
+"""The shift-tolerant AlexNet of ST-LPIPS: what `vestcl.evaluation.trunks.trunks` is to LPIPS, with anti-aliased
+strides.
 
 Against AlexNet: the first convolution has stride 1, and each of its strides of 2 is a blur and a stride (`BlurPool`);
 pooling takes the maximum at every pixel. Reflected borders are as wide as the blur on either side.

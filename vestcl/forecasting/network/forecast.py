@@ -91,8 +91,8 @@ def forecast_frames(
 
     A network that starts from what was measured corrects the geometric forecast: its camera's motion, its objects'
     velocities, and its image. Each of these parts is used where it wins a test on frames up to t
-    (`vestcl.forecasting.network.backtest`); without any, the result is the geometric forecast. A network that starts from rest, and
-    mode "feedback", have all parts and no test.
+    (`vestcl.forecasting.network.backtest`); without any, the result is the geometric forecast. A network that starts
+    from rest, and mode "feedback", have all parts and no test.
 
     Args:
         perception: of the clip.
@@ -221,7 +221,8 @@ def what_was_skipped(tally: Tally, profile: Mapping[str, float]) -> dict[str, Sk
 
 
 def show_frame(perception: Perception, model: Forecaster, index: int, views: Sequence[View]) -> dict[str, Rendered]:
-    """A frame itself as other cameras see it, at the same time; arguments and answer as `vestcl.forecasting.geometric.show_frame`.
+    """A frame itself as other cameras see it, at the same time; arguments and answer as
+    `vestcl.forecasting.geometric.show_frame`.
 
     Args:
         perception: of the clip.

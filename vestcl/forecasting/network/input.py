@@ -149,7 +149,8 @@ def last_motions(*frames: Prepared) -> list[NDArray[np.float64]]:
     """``cur_from_prev`` [4, 4] m of each frame that has a ``prev_from_cur``: all but a clip's first, oldest first.
 
     Args:
-        *frames: consecutive ones, oldest first; t - 1 and t give the two motions that `vestcl.forecasting.geometric` takes.
+        *frames: consecutive ones, oldest first; t - 1 and t give the two motions that `vestcl.forecasting.geometric`
+        takes.
 
     Returns:
         As many motions as frames, or one fewer.

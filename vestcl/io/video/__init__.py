@@ -1,1 +1,1 @@
-"""TODO"""
+"""Videos by PyAV: frames by index, and writing."""

@@ -97,7 +97,8 @@ def watching(seen: Seen | None = None) -> Iterator[Stopwatch]:
 
 
 def timed(method: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Let a method of STAGES report its time to the thread's `watching`, to `vestcl.opencl.trace` and to torch's profiler."""
+    """Let a method of STAGES report its time to the thread's `watching`, to `vestcl.opencl.trace` and to torch's
+    profiler."""
     name = (STAGES | _OTHER_WAYS)[method.__name__]
 
     @functools.wraps(method)

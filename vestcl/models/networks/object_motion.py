@@ -57,7 +57,8 @@ class ObjectMotion(nn.Module):
         )
         self.routing = None if config.routing is None else Routing(frames, len(config.scales), config.routing)
         self.multiple = math.lcm(*config.scales) * (_DMVFN_STRIDE if config.shape == "dmvfn" else 1)
-        #: What blocks get in place of the frames, at each scale, and how many of them: `vestcl.models.inference.fast` sets both.
+        #: What blocks get in place of the frames, at each scale, and how many of them: `vestcl.models.inference.fast`
+        #: sets both.
         self.shared: Callable[[torch.Tensor], Any] | None = None
         self.sharing = 0
 

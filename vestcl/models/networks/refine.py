@@ -31,8 +31,8 @@ class Refine(nn.Module):
     previous frame, b = c_cur + (1 - coverage_cur) c_prev. "filled" takes colours divided by coverage, opaque from
     OPAQUE on, the current frame over the previous one, and `fill`s what is left.
 
-    Of a geometric forecast (`RefineConfig.refines`) it takes `vestcl.forecasting.network.planes`, image I and coverage c among
-    them, and gives I + m(c) tanh(y): m is MOST_CHANGE from coverage OPAQUE on, and 1 where nothing is covered.
+    Of a geometric forecast (`RefineConfig.refines`) it takes `vestcl.forecasting.network.planes`, image I and coverage
+    c among them, and gives I + m(c) tanh(y): m is MOST_CHANGE from coverage OPAQUE on, and 1 where nothing is covered.
 
     Source: SPEC section 6; 3D Moments (CVPR 2022). There, four max-pools face five doublings, and the first doubled
     image is cut to its middle to fit; here the bottleneck has a max-pool of its own.

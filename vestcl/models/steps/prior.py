@@ -37,8 +37,8 @@ class MotionPrior(NamedTuple):
     """[B, n, 4] and [B, n, 3]: the camera's of the n intervals after t + 1, extrapolated; then the last one that is
     known repeats."""
     measured: torch.Tensor | None = None
-    """[B, MEASURED, RATES], the last motions as `vestcl.models.networks.camera_correction.rates_of` gives them, oldest first;
-    None is the two above."""
+    """[B, MEASURED, RATES], the last motions as `vestcl.models.networks.camera_correction.rates_of` gives them, oldest
+    first; None is the two above."""
     seconds: torch.Tensor | None = None
     """[B] s, one interval of the clip; None is 0.1."""
 

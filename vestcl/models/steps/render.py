@@ -119,7 +119,8 @@ def splat_cloud(
 ) -> Side:
     """Show a cloud in ``camera``: opaque points of radius r = rho z_src / z_tgt f_tgt / f_src, clamped to RADIUS.
 
-    Points that come so near that rho z_src / z_tgt is beyond RADIUS are left out, as `vestcl.forecasting.geometric.render` leaves
+    Points that come so near that rho z_src / z_tgt is beyond RADIUS are left out, as
+    `vestcl.forecasting.geometric.render` leaves
     them out: a ball of that size hides what it is not. A longer focal length leaves out none. With ``config.stretched``
     r grows with the distance to what was beside a point, and points that nothing is beside any more are left out, too:
     see `_surface`.

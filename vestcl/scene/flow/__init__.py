@@ -1,1 +1,1 @@
-"""TODO"""
+"""Where pixels of one frame are in another: correspondences, poses and parallax from them."""
