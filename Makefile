@@ -35,10 +35,10 @@ test: lint
 test-lowest: $(LOWEST)/.installed
 	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(LOWEST)/bin/pytest $(PYTEST_OPTIONS)
 
-$(LOWEST)/.installed: setup.py constraints.txt tests/lowest_versions.py
+$(LOWEST)/.installed: setup.py constraints.txt tests/support/lowest_versions.py
 	$(PYTHON) -m venv $(LOWEST)
 	$(LOWEST)/bin/python -m pip install --constraint constraints.txt setuptools torch
-	$(LOWEST)/bin/python tests/lowest_versions.py > $(LOWEST)/requirements.txt
+	$(LOWEST)/bin/python tests/support/lowest_versions.py > $(LOWEST)/requirements.txt
 	$(LOWEST)/bin/python -m pip install --no-build-isolation --requirement $(LOWEST)/requirements.txt --editable .
 	touch $@
 
@@ -63,7 +63,7 @@ devices-test: venv
 
 # Data races and accesses out of bounds: every kernel on small scenes, on Oclgrind's simulated device.
 oclgrind: venv
-	$(BIN)/python tests/oclgrind_scenes.py
+	$(BIN)/python tests/support/oclgrind_scenes.py
 
 clean:
 	rm -rf .venv $(LOWEST) build dist ./*.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache

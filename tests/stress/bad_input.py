@@ -1,8 +1,8 @@
 """Bad input on the command line, seeded: `python tests/stress/bad_input.py --share 1.0 --seed 0`.
 
-Options, inputs and files that vestcl and train must refuse (tests/bad_inputs.py draws them). Each must end within some
-seconds with exit status 2, one line on stderr (or the parser's box, which says how an option is used, or a line for
-each fault of a configuration) and nothing on stdout: no traceback, no hang, no crash.
+Options, inputs and files that vestcl and train must refuse (tests/support/bad_inputs.py draws them). Each must end
+within some seconds with exit status 2, one line on stderr (or the parser's box, which says how an option is used, or a
+line for each fault of a configuration) and nothing on stdout: no traceback, no hang, no crash.
 """
 
 import argparse
@@ -36,7 +36,7 @@ class Server:
     def answer(self, index: int) -> dict[str, Any]:
         """What case ``index`` came to."""
         if self.process is None:
-            command = [sys.executable, str(ROOT / "tests" / "bad_input_server.py")]
+            command = [sys.executable, str(ROOT / "tests" / "support" / "bad_input_server.py")]
             self.process = subprocess.Popen(
                 [*command, str(self.folder), str(self.seed), str(SECONDS)],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,

@@ -33,7 +33,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))  # the checkout's vestcl, whichever is installed
 
 import vestcl  # noqa: E402
-from vestcl.opencl import session as runtime
+from vestcl.opencl import session as runtime  # noqa: E402
 
 INTERRUPTS: Final = 2000
 #: Calls after the interrupts, which are compared with a fresh process.

@@ -1,0 +1,193 @@
+"""vestcl.forecasting.baselines by hand, and on textures whose motion is known."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from vestcl.evaluation import metrics
+from vestcl.forecasting.baselines import backward_warp, flow_extrapolation, invert_flow, optical_flow, repeat_last
+
+CLIP = Path(__file__).resolve().parents[3] / "shared" / "data" / "kitti_clip" / "image"
+
+HEIGHT, WIDTH = 96, 128
+
+Points = tuple[torch.Tensor, torch.Tensor]
+
+
+@pytest.fixture
+def texture() -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
+    """A picture [1, 3, H, W] that is known at every real x, y: forty waves of 8 to 40 px for each channel."""
+    angle, phase = 2 * math.pi * torch.rand(2, 3, 40, 1, 1)
+    wavelength = 8 + 32 * torch.rand(3, 40, 1, 1)
+
+    def picture(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        waves = (2 * math.pi / wavelength * (x * angle.cos() + y * angle.sin()) + phase).sin()
+        return (0.5 + 0.05 * waves.sum(dim=1)).clamp(0, 1)[None]
+
+    return picture
+
+
+def pixel_centres() -> Points:
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    return x, y
+
+
+def psnr_by_step(frames: torch.Tensor, truth: torch.Tensor, border: int = 12) -> torch.Tensor:
+    """dB at each step, away from the border, where new things come in that nobody can know."""
+    return metrics.psnr(*(images[..., border:-border, border:-border] for images in (frames[0], truth)))
+
+
+def test_repeat_last() -> None:
+    frame_prev, frame_cur = torch.rand(2, 2, 3, 4, 5)
+    frames = repeat_last(frame_prev, frame_cur, 3)
+    assert frames.shape == (2, 3, 3, 4, 5)
+    assert all(torch.equal(frames[:, k], frame_cur) for k in range(3))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_backward_warp_by_hand(dtype: torch.dtype) -> None:
+    image = torch.arange(12, dtype=dtype).reshape(1, 1, 3, 4)
+    flow_uv = torch.zeros(1, 2, 3, 4, dtype=dtype)
+    torch.testing.assert_close(backward_warp(image, flow_uv), image)
+    flow_uv[:, 0] = 1
+    wanted = torch.tensor([[1.0, 2, 3, 3], [5, 6, 7, 7], [9, 10, 11, 11]], dtype=dtype)[None, None]
+    torch.testing.assert_close(backward_warp(image, flow_uv), wanted)
+    flow_uv[:, 0], flow_uv[:, 1] = 0, -0.5
+    wanted = torch.tensor([[0.0, 1, 2, 3], [2, 3, 4, 5], [6, 7, 8, 9]], dtype=dtype)[None, None]
+    torch.testing.assert_close(backward_warp(image, flow_uv), wanted)
+
+
+def test_backward_warp_gradients() -> None:
+    image = torch.rand(1, 2, 5, 6, dtype=torch.float64, requires_grad=True)
+    flow_uv = (0.1 + 0.8 * torch.rand(1, 2, 5, 6, dtype=torch.float64)).requires_grad_()
+    assert torch.autograd.gradcheck(backward_warp, (image, flow_uv))
+
+
+def test_optical_flow_of_a_shift(texture: Any) -> None:
+    x, y = pixel_centres()
+    src, dst = texture(x, y), texture(x - 2.25, y + 1.5)
+    flow_uv = optical_flow(torch.cat([src, dst]), torch.cat([dst, src]))
+    inner = flow_uv[..., 12:-12, 12:-12]
+    wanted = torch.tensor([[2.25, -1.5], [-2.25, 1.5]])[:, :, None, None]
+    assert flow_uv.shape == (2, 2, HEIGHT, WIDTH) and flow_uv.dtype == torch.float32
+    assert float((inner - wanted).abs().mean()) < 0.05
+
+
+@pytest.mark.parametrize("follow", ["place", "point"])
+def test_a_moving_texture_is_followed(texture: Any, follow: Any) -> None:
+    x, y = pixel_centres()
+    at = [texture(x - 1.7 * t, y + 0.6 * t) for t in range(-1, 5)]
+    truth = torch.cat(at[2:])
+    frames = flow_extrapolation(at[0], at[1], 4, follow)
+    assert frames.shape == (1, 4, 3, HEIGHT, WIDTH)
+    repeated = psnr_by_step(repeat_last(at[0], at[1], 4), truth)
+    assert (psnr_by_step(frames, truth) > repeated + 10).all()
+
+
+def test_driving_forward_a_place_keeps_its_flow(texture: Any) -> None:
+    """A zoom by the same factor every step, as in a corridor: exact for "place", linear for "point"."""
+    x, y = (centre - size / 2 for centre, size in zip(pixel_centres(), (WIDTH, HEIGHT), strict=True))
+    at = [texture(x / 1.04**t, y / 1.04**t) for t in range(-1, 6)]
+    truth = torch.cat(at[2:])
+    place, point = (psnr_by_step(flow_extrapolation(at[0], at[1], 5, follow), truth) for follow in ("place", "point"))
+    repeated = psnr_by_step(repeat_last(at[0], at[1], 5), truth)
+    assert (place > repeated + 6).all() and (place[2:] > point[2:] + 2).all()
+
+
+def test_an_object_before_a_background_at_rest_keeps_its_motion(texture: Any) -> None:
+    """Its motion goes with it for "point"; for "place" it stays where it was, and the object does not arrive."""
+    x, y = pixel_centres()
+    step = 6
+
+    def frame(t: int) -> torch.Tensor:
+        is_object = ((x - 40 - step * t).abs() < 20) & ((y - 48).abs() < 24)
+        return torch.where(is_object, texture(x - step * t + 300, y), texture(x, y))
+
+    point, place = (flow_extrapolation(frame(-1), frame(0), 3, follow)[:, 2] for follow in ("point", "place"))
+    inside = (((x - 40 - 3 * step).abs() < 16) & ((y - 48).abs() < 20))[None, None]
+    assert float(metrics.psnr(point, frame(3), inside)) > float(metrics.psnr(place, frame(3), inside)) + 6
+
+
+def test_invert_flow_of_a_shift_fills_its_hole() -> None:
+    flow_uv = torch.zeros(1, 2, 5, 6)
+    flow_uv[:, 0] = 2
+    torch.testing.assert_close(invert_flow(flow_uv), -flow_uv)
+    assert torch.equal(invert_flow(torch.zeros(2, 2, 3, 4)), torch.zeros(2, 2, 3, 4))
+
+
+def test_invert_flow_lets_the_fastest_win() -> None:
+    flow_uv = torch.zeros(1, 2, 1, 5)
+    flow_uv[0, 0, 0, 1] = 2  # lands on pixel 3, which stays, and leaves a hole at 1
+    inverted = invert_flow(flow_uv)[0, 0, 0].tolist()
+    assert inverted[0] == 0 and inverted[2:] == [0, -2, 0]
+    flow_uv[0, 0, 0, 3] = -3  # lands on pixel 0; the hole lies between motions of 3 and 0
+    inverted = invert_flow(flow_uv)[0, 0, 0].tolist()
+    assert inverted[0] == 3 and 0 < inverted[1] < 3 and inverted[2:] == [0, -2, 0]
+
+
+def test_invert_flow_of_what_has_left_is_zero() -> None:
+    flow_uv = torch.full((1, 2, 4, 5), 100.0)
+    flow_uv[0, 1, 2, 2] = math.nan
+    assert torch.equal(invert_flow(flow_uv), torch.zeros(1, 2, 4, 5))
+
+
+def test_invert_flow_there_and_back(texture: Any) -> None:
+    """A smooth motion inverted: b(p + f(p)) = -f(p)."""
+    x, y = pixel_centres()
+    flow_uv = torch.stack([3 * (y / 20).sin() + 0.05 * x, 2 * (x / 25).cos()])[None]
+    returned = backward_warp(invert_flow(flow_uv), flow_uv)
+    assert float((returned + flow_uv)[..., 12:-12, 12:-12].abs().max()) < 0.5
+
+
+@pytest.mark.parametrize("follow", ["place", "point"])
+def test_a_still_scene_stays(texture: Any, follow: Any) -> None:
+    frame = texture(*pixel_centres())
+    frames = flow_extrapolation(frame, frame, 2, follow)
+    torch.testing.assert_close(frames, repeat_last(frame, frame, 2), atol=1e-4, rtol=0)
+
+
+def test_batch_and_order_do_not_matter(texture: Any) -> None:
+    x, y = pixel_centres()
+    frame_prev, frame_cur = (torch.cat([texture(x - t, y), texture(x, y - 2 * t)]) for t in (0, 1))
+    both = flow_extrapolation(frame_prev, frame_cur, 2)
+    alone = flow_extrapolation(frame_prev[1:], frame_cur[1:], 2)
+    assert torch.equal(both[1:], alone)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda i: repeat_last(i, i, 0), "`steps` must be 1 or more, got 0"),
+        (lambda i: flow_extrapolation(i, i, 0), "`steps` must be 1 or more, got 0"),
+        (
+            lambda i: flow_extrapolation(i, i[..., :-1], 1),
+            r"`frame_cur` must be \[1, 3, 16, 16\], got \[1, 3, 16, 15",
+        ),
+        (lambda i: flow_extrapolation(i, i, 1, "points"), '`follow` must be "place" or "point", got \'points\''),
+        (lambda i: optical_flow(i[..., :8], i[..., :8]), "H and W must be 12 or more for optical flow, got 16 x 8"),
+        (lambda i: optical_flow(i[:, :1], i), r"`src` must be \[B, 3, H, W\], got \[1, 1, 16, 16\]"),
+        (lambda i: backward_warp(i, i), r"`flow_uv` must be \[1, 2, 16, 16\], got \[1, 3, 16, 16\]"),
+        (lambda i: invert_flow(i), r"`flow_uv` must be \[B, 2, H, W\], got \[1, 3, 16, 16\]"),
+    ],
+)
+def test_refuses(call: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call(torch.rand(1, 3, 16, 16))
+
+
+@pytest.mark.skipif(not CLIP.is_dir(), reason="the KITTI clip of ../shared/data is absent")
+def test_real_driving() -> None:
+    files = sorted(CLIP.iterdir())[7:13]
+    pixels = [np.asarray(Image.open(file).resize((416, 128), Image.Resampling.BOX)) for file in files]
+    at = [torch.from_numpy(frame.copy()).permute(2, 0, 1)[None].float() / 255 for frame in pixels]
+    truth = torch.cat(at[2:])
+    repeated = metrics.psnr(repeat_last(at[0], at[1], 4)[0], truth)
+    for follow in ("place", "point"):
+        followed = metrics.psnr(flow_extrapolation(at[0], at[1], 4, follow)[0], truth)
+        assert (followed > repeated + 3).all()
