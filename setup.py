@@ -12,10 +12,10 @@ setup(
     license="Apache-2.0",
     license_files=["LICENSE"],
     python_requires=">=3.10",
-    # The kernels live beside the package in a checkout and inside it in a wheel; runtime.kernel_folder() knows both.
+    # The kernels live beside the package in a checkout and inside it in a wheel; opencl.kernel_folder() knows both.
     packages=[*find_packages(include=["vestcl", "vestcl.*"]), "vestcl.kernels"],
     package_dir={"vestcl.kernels": "kernels"},
-    package_data={"vestcl": ["weights/*.safetensors"], "vestcl.kernels": ["*.cl", "*.h"]},
+    package_data={"vestcl": ["weights/*.safetensors"], "vestcl.kernels": ["*.cl", "*.h", "*/*.cl", "*/*.h"]},
     install_requires=[
         "av>=17.1",  # the newest for Python 3.10
         "matplotlib>=3.8",

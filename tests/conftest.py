@@ -10,7 +10,8 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from vestcl.opencl import session as runtime
+from vestcl import opencl
+from vestcl.opencl import selection
 
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
@@ -22,11 +23,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
 
 
-def _devices() -> list[runtime.DeviceInfo]:
+def _devices() -> list[opencl.DeviceInfo]:
     wanted = os.environ.get("VESTCL_TEST_DEVICES", "")
     if wanted == "all":  # Clover lists GPUs that it can't compile for
-        return [info for info in runtime.devices() if info.platform != "Clover"]
-    return [runtime.select(selector.strip() or None) for selector in wanted.split(",")]
+        return [info for info in opencl.devices() if info.platform != "Clover"]
+    return [opencl.select(selector.strip() or None) for selector in wanted.split(",")]
 
 
 def _mapped() -> list[tuple[str, str]]:
@@ -42,22 +43,22 @@ def _seed() -> None:
 @pytest.fixture(autouse=True)
 def _devices_are_given_back() -> Iterator[None]:
     """What a test leaves in use, the next one would run on."""
-    before = runtime._selected.get()
+    before = selection._selected.get()
     yield
-    assert runtime._selected.get() is before, "the test left another device in use"
+    assert selection._selected.get() is before, "the test left another device in use"
 
 
 @pytest.fixture(params=[info.index for info in _devices()])
-def session(request: pytest.FixtureRequest) -> Iterator[runtime.Session]:
+def session(request: pytest.FixtureRequest) -> Iterator[opencl.Session]:
     """Each device under test, with the mapping that suits it."""
-    with runtime.use(request.param) as opened:
+    with opencl.use(request.param) as opened:
         yield opened
 
 
 @pytest.fixture(params=_mapped(), ids="-".join)
-def mapped_session(request: pytest.FixtureRequest) -> Iterator[runtime.Session]:
+def mapped_session(request: pytest.FixtureRequest) -> Iterator[opencl.Session]:
     """Each device under test; a CPU with both mappings, so that it tests the GPUs' path too."""
-    with runtime.use(*request.param) as opened:
+    with opencl.use(*request.param) as opened:
         yield opened
 
 

@@ -52,7 +52,7 @@ def test_the_twins_stand_alone(file: Path) -> None:
 
 
 def test_the_runtime_knows_no_operator() -> None:
-    ours = {module for module in imports(ROOT / "vestcl" / "runtime.py") if is_in(module, "vestcl")}
+    ours = {module for module in imports(ROOT / "vestcl" / "opencl.py") if is_in(module, "vestcl")}
     assert ours <= {f"vestcl.{name}" for name in ("constants", "icd", "pocl_cache", "pocl_cpu", "robust_lock")}
 
 
@@ -66,10 +66,10 @@ def test_operators_stand_on_the_runtime(file: Path) -> None:
 def test_importing_vestcl_loads_no_driver() -> None:
     """A driver in memory means that something has enumerated the platforms."""
     code = (
-        "import vestcl, vestcl.opencl.session as runtime\n"
-        "assert runtime._all_devices.cache_info().currsize == 0\n"
+        "import vestcl, vestcl.opencl.device_list as device_list\n"
+        "assert device_list.all_devices.cache_info().currsize == 0\n"
         "assert 'libpocl' not in open('/proc/self/maps').read()\n"
-        "assert runtime.devices()\n"
+        "assert opencl.devices()\n"
         "assert 'libpocl' in open('/proc/self/maps').read()"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

@@ -18,9 +18,10 @@ ROOT = Path(__file__).resolve().parents[1]
 WEIGHTS = "vestcl/weights/vest-s.safetensors"
 BUILD_A_KERNEL = """
 import numpy as np
-from vestcl import pretrained, runtime
-runtime.current().kernel("unproject.cl", "unproject", runtime.defines_for(np.dtype(np.float32)))
-print(runtime.kernel_folder())
+from vestcl import opencl
+from vestcl.models.inference import pretrained
+opencl.current().kernel("unproject.cl", "unproject", opencl.defines_for(np.dtype(np.float32)))
+print(opencl.kernel_folder())
 print(pretrained.shipped()["vest-s"])
 """
 

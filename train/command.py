@@ -12,13 +12,13 @@ from rich.text import Text
 
 from train.run.checkpoint import CheckpointError
 from train.run.ranks import LostProcessError
-from vestcl.opencl import session as runtime
+from vestcl import opencl
 
 #: Exit status of a command that could not do what it was asked for.
 FAILED: Final = 2
 
 #: What a user can put right: settings, files, the disk, devices, other processes.
-ERRORS: Final = (ValueError, OSError, runtime.DeviceError, CheckpointError, LostProcessError)
+ERRORS: Final = (ValueError, OSError, opencl.DeviceError, CheckpointError, LostProcessError)
 
 #: What torch says, at any place of the main process, when a data loader's process has ended.
 _WORKER: Final = re.compile(r"DataLoader worker \(pid\(?s?\)?")

@@ -33,7 +33,7 @@ from train.evaluation.setup import Setup
 from train.evaluation.sheets import write_sheets
 from train.evaluation.windows import Part, plan, read_inputs, read_part, run_part
 from train.run.ranks import Ranks, local_rank
-from vestcl import __version__
+from vestcl import __version__, opencl
 from vestcl.bench.common import results as _results
 from vestcl.cli import command_line, interrupt, options
 from vestcl.cli.prepare import shard
@@ -48,7 +48,6 @@ from vestcl.forecasting import peer
 from vestcl.io.atomic import write_bytes
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.opencl import session as runtime
 
 #: Columns where tables don't go to a terminal.
 WIDTH: Final = 200
@@ -90,7 +89,7 @@ def evaluate(config: Evaluation) -> None:
     parts = plan(sources, protocol, setup.steps, config.every, out / "clips", key_of(about))
     console = _results.console(WIDTH)
     device = config.device or Ranks(local=local_rank()).device()
-    with runtime.use(device) as session:
+    with opencl.use(device) as session:
         if not config.merge:
             _run(parts[rank::ranks], setup, console)
         done = [read_part(part) for part in parts]

@@ -29,13 +29,13 @@ from train.run.ranks import Ranks, lost_processes_named
 from train.run.report import Reporter
 from train.run.trainer import Average, NotANumberError, Trainer, build_model
 from train.settings.config import Config, DataConfig, load_config, to_dict
+from vestcl import opencl
 from vestcl.cli import command_line, interrupt
 from vestcl.data.readers.splits import KITTI_TRAINING
 from vestcl.models.checkpoint import Frames, read_trained_on
 from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.weights_file import misfit
-from vestcl.opencl import session as runtime
 from vestcl.prepare.prepared import find_prepared
 
 #: The exit status of a run that was told to stop (SIGTERM), as a shell has it.
@@ -108,7 +108,7 @@ def fit(config: Config, *, go_on: bool = False, ranks: Ranks | None = None, devi
     state = _last_state(config, go_on)
     if config.run.threads:
         torch.set_num_threads(config.run.threads)
-    with runtime.use(device or ranks.device()), _stop_signal() as stop:
+    with opencl.use(device or ranks.device()), _stop_signal() as stop:
         run = _Run(config, ranks, stop)
         with interrupt.summary(run.where):
             finished = run.go(state)
@@ -281,7 +281,7 @@ class _Run:
         return (
             f"{self.config.name}: {self.config.model}, {count:,} parameters, {begin}to step {self.config.steps}, "
             f"{self.ranks.world} process{'es' if self.ranks.world > 1 else ''}, {torch.get_num_threads()} threads, "
-            f"{runtime.current().info.name}"
+            f"{opencl.current().info.name}"
         )
 
 

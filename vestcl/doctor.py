@@ -17,8 +17,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from vestcl import opencl
 from vestcl.opencl import icd, pocl_cache, pocl_cpu
-from vestcl.opencl import session as runtime
 
 #: What a child tries on its device, in this order; the first failure ends it.
 STEPS: Final = ("build", "run", "float64", "splat")
@@ -37,7 +37,7 @@ class Step:
 class DeviceReport:
     """One device: the steps that its child came through, the last one failed unless ``works``."""
 
-    info: runtime.DeviceInfo
+    info: opencl.DeviceInfo
     steps: tuple[Step, ...]
     notes: tuple[str, ...]
 
@@ -73,7 +73,7 @@ def examine(timeout: float = 120.0) -> Report:
     if listing.ending:
         notes.append(f"listing the devices failed: {listing.ending}")
         notes.append(f"find the driver at fault: move the .icd files in {icd.vendors()} away one by one")
-    infos = [runtime.DeviceInfo(**line["device"]) for line in listing.lines if "device" in line]
+    infos = [opencl.DeviceInfo(**line["device"]) for line in listing.lines if "device" in line]
     if not infos and not listing.ending:
         notes.append(icd.no_device())
     elif cache.note or cache.fault:
@@ -115,7 +115,7 @@ def _ending(code: int, errors: str) -> str:
     return said[-1] if code else ""
 
 
-def _examine_device(info: runtime.DeviceInfo, timeout: float) -> DeviceReport:
+def _examine_device(info: opencl.DeviceInfo, timeout: float) -> DeviceReport:
     child = _run_child([sys.executable, "-m", "vestcl.doctor", info.index], timeout)
     steps = [Step(**line) for line in child.lines]
     if child.ending:
@@ -147,11 +147,11 @@ def _driver_notes(timeout: float) -> Iterator[str]:
 
 
 def _list_devices() -> None:
-    for info in runtime.devices():
+    for info in opencl.devices():
         _say(device=dataclasses.asdict(info))
     try:
-        _say(default=runtime.select().index)
-    except runtime.DeviceError as error:
+        _say(default=opencl.select().index)
+    except opencl.DeviceError as error:
         _say(error=str(error))
 
 
@@ -166,7 +166,7 @@ def _try_device(index: str) -> None:
     for name, attempt in attempts.items():
         try:
             fault = attempt()
-        except (runtime.DeviceError, ImportError) as error:
+        except (opencl.DeviceError, ImportError) as error:
             fault = str(error)
         _say(name=name, passed=not fault, detail=fault)
         if fault and name != "float64":
@@ -174,8 +174,8 @@ def _try_device(index: str) -> None:
 
 
 def _build(index: str) -> str:
-    runtime.use(index)
-    runtime.current().kernel("unproject.cl", "unproject", runtime.defines_for(np.dtype(np.float32)))
+    opencl.use(index)
+    opencl.current().kernel("unproject.cl", "unproject", opencl.defines_for(np.dtype(np.float32)))
     return ""
 
 

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 import torch
 
+from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.timing import LEAST_ROUNDS
 from vestcl.bench.splat import operators
 from vestcl.bench.splat.operators import PASSES, OperatorsBench
-from vestcl.opencl import session as runtime
 
 #: Nothing runs longer than its least number of rounds.
 TINY: dict[str, Any] = {"height": 16, "width": 24, "channels": 5, "seconds": 1e-3}
@@ -20,7 +20,7 @@ NAMES = ["unproject", "rigid_flow", "displace", "splat"]
 
 
 def test_a_run_writes_and_prints_everything(
-    session: runtime.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    session: opencl.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     files = {name: tmp_path / "new" / f"results.{name}" for name in ("json", "markdown", "trace")}

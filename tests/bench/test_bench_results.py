@@ -13,14 +13,13 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from vestcl import doctor
+from vestcl import doctor, opencl
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.results import Measure, Results
 from vestcl.bench.common.timing import Spread
 from vestcl.bench.splat import report as _report
 from vestcl.evaluation.tables import Grid
-from vestcl.opencl import session as runtime
 
 
 def results(bench: str = "abacus", device: str = "0:0 frame", **details: Any) -> Results:
@@ -37,9 +36,9 @@ def console() -> Console:
     return Console(width=100, record=True, file=io.StringIO())
 
 
-def doctored(monkeypatch: pytest.MonkeyPatch, *works: bool) -> list[runtime.DeviceInfo]:
+def doctored(monkeypatch: pytest.MonkeyPatch, *works: bool) -> list[opencl.DeviceInfo]:
     """Let the doctor find devices that work or not, all of them the default one."""
-    infos = [runtime.select() for _ in works]
+    infos = [opencl.select() for _ in works]
     passed, failed = tuple(doctor.Step(name, True) for name in doctor.STEPS), (doctor.Step("build", False, "ill"),)
     steps = {True: passed, False: failed}
     reports = [
@@ -140,11 +139,11 @@ def test_the_screen_shows_machine_and_tables(console: Console) -> None:
 # ---------------------------------------------------------------- devices
 
 
-def test_one_device_is_current_while_it_is_measured(session: runtime.Session) -> None:
-    before = runtime.current()
-    seen = [(one, runtime.current()) for one in _results.each_device(session.info.index)]
+def test_one_device_is_current_while_it_is_measured(session: opencl.Session) -> None:
+    before = opencl.current()
+    seen = [(one, opencl.current()) for one in _results.each_device(session.info.index)]
     assert [one.info.index for one, _ in seen] == [session.info.index] and seen[0][0] is seen[0][1]
-    assert runtime.current() is before
+    assert opencl.current() is before
     machine = _results.describe(session)
     assert {"vestcl", "torch", "numpy", "pyopencl", "driver", "processor", "cores", "date"} <= set(machine)
     assert machine["device"].startswith(session.info.index)
@@ -158,7 +157,7 @@ def test_all_devices_are_those_that_the_doctor_passes(monkeypatch: pytest.Monkey
 
 def test_no_device_works(monkeypatch: pytest.MonkeyPatch, console: Console) -> None:
     doctored(monkeypatch, False)
-    with pytest.raises(runtime.DeviceError, match="`vestcl doctor` tells why"):
+    with pytest.raises(opencl.DeviceError, match="`vestcl doctor` tells why"):
         list(_results.each_device("all", console))
 
 
@@ -168,8 +167,8 @@ def test_a_device_that_fails_is_reported_and_the_others_go_on(
     doctored(monkeypatch, True, True)
     outcomes: Iterator[Any] = iter([RuntimeError("burst"), results()])
 
-    def measure(session: runtime.Session) -> Results:
-        assert session is runtime.current()
+    def measure(session: opencl.Session) -> Results:
+        assert session is opencl.current()
         outcome = next(outcomes)
         if isinstance(outcome, Exception):
             raise outcome
@@ -178,7 +177,7 @@ def test_a_device_that_fails_is_reported_and_the_others_go_on(
     assert [found.bench for found in _results.measure_each("all", measure, console)] == ["abacus"]
     assert "left out: RuntimeError: burst" in _flat(console)
     outcomes = iter([RuntimeError("burst"), RuntimeError("burst")])
-    with pytest.raises(runtime.DeviceError, match="failed on every device"):
+    with pytest.raises(opencl.DeviceError, match="failed on every device"):
         _results.measure_each("all", measure, console)
     outcomes = iter([ValueError("`height` must be positive")])
     with pytest.raises(ValueError, match="height"):

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from vestcl import constants, reference
+from vestcl import constants, opencl, reference
 from vestcl.bench.common import results as _results
 from vestcl.bench.stability import bench as stability
 from vestcl.bench.stability import peers as _stability_peers
@@ -21,7 +21,6 @@ from vestcl.bench.stability.cases import FAMILIES, SIZE, Case
 from vestcl.bench.stability.fragments import list_layers
 from vestcl.bench.stability.places import clear_radii, projected
 from vestcl.bench.stability.programs import OPERATORS, Operators, evaluate, relative_error
-from vestcl.opencl import session as runtime
 
 TWINS = Operators(reference.unproject, reference.rigid_flow, reference.displace, reference.splat)
 
@@ -90,7 +89,7 @@ def error_of_motion(case: Case, displacement_xyz: torch.Tensor, count: int = 20)
 
 
 @pytest.mark.parametrize("case", cases("layers", "opacity", "angle", "recursion"), ids=lambda case: case.name)
-def test_every_mapping_keeps_the_bounds(mapped_session: runtime.Session, case: Case) -> None:
+def test_every_mapping_keeps_the_bounds(mapped_session: opencl.Session, case: Case) -> None:
     assert not stability.measure_case(case, peers=False).broken
 
 
@@ -282,10 +281,10 @@ def test_what_it_refuses(name: str, value: Any, message: str) -> None:
         stability.main(StabilityBench(quick=True, **{name: value}))
 
 
-def test_without_float64_there_is_no_truth(monkeypatch: pytest.MonkeyPatch, session: runtime.Session) -> None:
+def test_without_float64_there_is_no_truth(monkeypatch: pytest.MonkeyPatch, session: opencl.Session) -> None:
     info = dataclasses.replace(session.info, float64=False)
     monkeypatch.setattr(session, "info", info)
-    monkeypatch.setattr(runtime, "select", lambda: info)
-    monkeypatch.setattr(runtime, "devices", lambda: [info])
-    with pytest.raises(runtime.DeviceError, match="no OpenCL device has float64"):
+    monkeypatch.setattr(opencl, "select", lambda: info)
+    monkeypatch.setattr(opencl, "devices", lambda: [info])
+    with pytest.raises(opencl.DeviceError, match="no OpenCL device has float64"):
         stability.measure_case(case_at("angle", 1e-6))

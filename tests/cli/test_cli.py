@@ -10,10 +10,9 @@ from typing import get_args, get_type_hints
 import pytest
 from stand_ins import put_module
 
-from vestcl import __version__, doctor
+from vestcl import __version__, doctor, opencl
 from vestcl.cli import main as cli
 from vestcl.io.labels import LabelKind
-from vestcl.opencl import session as runtime
 
 
 @pytest.fixture(autouse=True)
@@ -23,7 +22,7 @@ def _wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_devices_marks_the_one_in_use(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    for info in runtime.devices():
+    for info in opencl.devices():
         monkeypatch.setenv("VESTCL_DEVICE", info.index)
         assert cli.main(["devices"]) == 0
         table = capsys.readouterr().out
@@ -63,10 +62,10 @@ def test_help_and_mistakes(arguments: str, code: int, capsys: pytest.CaptureFixt
 def test_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
     put_module(
-        monkeypatch, "vestcl.cli.demo", run=lambda *arguments: calls.append((*arguments, runtime.current().info.index))
+        monkeypatch, "vestcl.cli.demo", run=lambda *arguments: calls.append((*arguments, opencl.current().info.index))
     )
-    last = runtime.devices()[-1].index
-    before = runtime.current()
+    last = opencl.devices()[-1].index
+    before = opencl.current()
     assert cli.main(["demo"]) == 0
     options = "--out x --height 8 --width 9 --seed 3 --quality fast --device"
     assert cli.main(["demo", *options.split(), last]) == 0
@@ -75,10 +74,10 @@ def test_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     assert usual == (Path("out"), 256, 832, 0, None, "balanced", before.info.index)
     assert given == (Path("x"), 8, 9, 3, None, "fast", last)
     assert geometric[4] == "geometric"
-    assert runtime.current() is before
+    assert opencl.current() is before
 
 
-@pytest.mark.parametrize("kind", [ValueError, PermissionError, FileNotFoundError, runtime.DeviceError])
+@pytest.mark.parametrize("kind", [ValueError, PermissionError, FileNotFoundError, opencl.DeviceError])
 def test_what_a_user_can_put_right_is_one_line(
     kind: type[Exception], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -199,7 +198,7 @@ def test_label_ids_are_those_of_the_readers() -> None:
 
 
 def test_doctor_tells_what_works(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    info = runtime.select()
+    info = opencl.select()
     sound = doctor.DeviceReport(info, tuple(doctor.Step(name, True) for name in doctor.STEPS), ())
     ill = doctor.DeviceReport(info, (doctor.Step("build", False, "no [ld]"),), ("build: no [ld]",))
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from stand_ins import put_module
 
+from vestcl import opencl
 from vestcl.cli import main as cli
 from vestcl.opencl import pocl_cache
-from vestcl.opencl import session as runtime
 
 ROOT = Path(__file__).resolve().parents[2]
 DEVICES = [sys.executable, "-c", "import sys; from vestcl.cli.main import main; sys.exit(main())", "devices"]
@@ -24,7 +24,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
         (OSError("no luck"), "no luck"),
         (MemoryError("Unable to allocate 7 TiB\nfor an array"), "out of memory: smaller images and fewer steps need"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: 7 bytes"), "out of memory: smaller"),
-        (runtime.DeviceError("no [device]"), "no [device]"),
+        (opencl.DeviceError("no [device]"), "no [device]"),
     ],
 )
 def test_errors_of_the_machine_are_one_line(

@@ -13,13 +13,13 @@ from onnx_files import write_mix
 from st_lpips_weights import public_state
 from stand_ins import put_module
 
+from vestcl import opencl
 from vestcl.cli import main as cli
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
 from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecasting.files import read_forecast
 from vestcl.io.video.reading import Video
-from vestcl.opencl import session as runtime
 
 
 @pytest.fixture
@@ -39,13 +39,13 @@ def folder(tmp_path: Path) -> Path:
 def test_everything_at_once(
     folder: Path, tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out, last, before = tmp_path / "out", runtime.devices()[-1].index, runtime.current()
+    out, last, before = tmp_path / "out", opencl.devices()[-1].index, opencl.current()
     told = f"forecast {folder} --out {out} --steps 2 --view right --view source --view -0.5,0,0,yaw=5,name=side"
     assert cli.main([*told.split(), "--compare", "--gif", "--device", last]) == 0
     ((clip, index, steps, views),) = repeater.calls
     assert (len(clip), index, steps, [view.name for view in views]) == (6, 3, 2, ["right", "source", "side"])
     assert repeater.devices == [last]
-    assert runtime.current() is before
+    assert opencl.current() is before
     saved = read_forecast(out)
     assert np.array_equal(saved.image(2, "side"), clip[3].read_image())
     depth = saved.frame(1, "side").depth

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from vestcl import opencl
 from vestcl.data import SKY_DEPTH, Frame, Label
 from vestcl.data.street import objects
 from vestcl.data.street.raycast import SHADOW_CELL, SHADOW_REACH, Material, Scene, Shape, Solids, blank_frame, cast
-from vestcl.opencl import session as runtime
 
 EYE, FOCAL, HEIGHT, WIDTH = 1.5, 40.0, 48, 64
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
@@ -34,7 +34,7 @@ def rays() -> tuple[np.ndarray, np.ndarray]:
     return (u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL
 
 
-def test_box_by_hand(session: runtime.Session) -> None:
+def test_box_by_hand(session: opencl.Session) -> None:
     """A box 2 m wide and high, its front 9 m ahead; beside it the road at z = h f / (v - cy), above it the sky."""
     frame = look(plain(Shape.BOX, (0.0, -1.0, 10.0), (1.0, 1.0, 1.0)))
     x, y = rays()
@@ -48,7 +48,7 @@ def test_box_by_hand(session: runtime.Session) -> None:
     assert np.array_equal(frame.labels[0, 0], labels)
 
 
-def test_tapered_box_by_hand(session: runtime.Session) -> None:
+def test_tapered_box_by_hand(session: opencl.Session) -> None:
     """A wedge: its back face slopes from z = 8 at the bottom to z = 10 at the top, 4 m up, where it is half as wide."""
     frame = look(plain(Shape.BOX, (0.0, -2.0, 10.0), (2.0, 2.0, 2.0), taper=(0.5, 0.0, 1.0)))
     x, y = rays()
@@ -63,7 +63,7 @@ def test_tapered_box_by_hand(session: runtime.Session) -> None:
 
 
 @pytest.mark.parametrize("shape", [Shape.ELLIPSOID, Shape.CYLINDER])
-def test_round_solids_by_hand(session: runtime.Session, shape: Shape) -> None:
+def test_round_solids_by_hand(session: opencl.Session, shape: Shape) -> None:
     """A ball of radius 1 m at the eye's height, or a post of it on the road and beyond the picture, 10 m ahead."""
     ball = shape == Shape.ELLIPSOID
     frame = look(plain(shape, (0.0, -EYE if ball else -25.0, 10.0), (1.0, 1.0 if ball else 25.0, 1.0)))
@@ -78,14 +78,14 @@ def test_round_solids_by_hand(session: runtime.Session, shape: Shape) -> None:
     assert not np.any(frame.labels[0, 0][room < -0.1] == Label.POLE)
 
 
-def test_a_turned_box_is_the_box_turned(session: runtime.Session) -> None:
+def test_a_turned_box_is_the_box_turned(session: opencl.Session) -> None:
     box = plain(Shape.BOX, (0.0, -1.0, 0.0), (1.0, 1.0, 3.0))
     quarter = look(objects.placed(box, 0.0, 0.0, 12.0, np.pi / 2))
     swapped = look(plain(Shape.BOX, (0.0, -1.0, 12.0), (3.0, 1.0, 1.0)))
     np.testing.assert_allclose(quarter.depth, swapped.depth, rtol=1e-4)
 
 
-def test_what_is_nearer_hides(session: runtime.Session) -> None:
+def test_what_is_nearer_hides(session: opencl.Session) -> None:
     near = plain(Shape.BOX, (0.0, -1.0, 6.0), (0.5, 1.0, 0.5))
     far = plain(Shape.ELLIPSOID, (0.5, -1.0, 12.0), (2.0, 1.0, 1.0))
     one, other, both, swapped = (look(*solids) for solids in ([near], [far], [near, far], [far, near]))
@@ -93,14 +93,14 @@ def test_what_is_nearer_hides(session: runtime.Session) -> None:
     assert np.array_equal(both.depth, swapped.depth)
 
 
-def test_nothing_behind_or_around_the_camera_is_seen(session: runtime.Session) -> None:
+def test_nothing_behind_or_around_the_camera_is_seen(session: opencl.Session) -> None:
     behind = plain(Shape.BOX, (0.0, -1.0, -5.0), (2.0, 2.0, 2.0))
     around = plain(Shape.ELLIPSOID, (0.0, -EYE, 0.0), (1.0, 1.0, 1.0))
     frame = look(behind, around)
     assert not np.any(frame.labels == Label.POLE)
 
 
-def test_shadow_falls_away_from_the_sun(session: runtime.Session) -> None:
+def test_shadow_falls_away_from_the_sun(session: opencl.Session) -> None:
     """A post 2 m high under a sun at 45 degrees on the left: the road on its right is dark for 2 m."""
     half = np.sqrt(0.5)
     post = plain(Shape.BOX, (0.0, -1.0, 8.0), (0.2, 1.0, 0.2))
@@ -116,7 +116,7 @@ def test_shadow_falls_away_from_the_sun(session: runtime.Session) -> None:
     assert dark.max() < 0.8 * light.min()
 
 
-def test_instances_by_hand(session: runtime.Session) -> None:
+def test_instances_by_hand(session: opencl.Session) -> None:
     """Of a box with a number, before one without: 7 on its front, 0 on the other, the road and the sky."""
     front = plain(Shape.BOX, (0.0, -1.0, 10.0), (1.0, 1.0, 1.0))
     front["instance"] = 7
@@ -128,7 +128,7 @@ def test_instances_by_hand(session: runtime.Session) -> None:
     assert set(np.unique(frame.instances)) == {0, 7}
 
 
-def test_samples_cover_part_of_a_pixel(session: runtime.Session) -> None:
+def test_samples_cover_part_of_a_pixel(session: opencl.Session) -> None:
     """A far post 1.5 pixels wide: many rays see it in part of its two columns, one ray in all or nothing of them."""
     post = plain(Shape.BOX, (0.0, -25.0, 20.0), (0.375, 25.0, 0.01))
     one, many = look(post), look(post, samples=4)
@@ -145,7 +145,7 @@ def test_shadows_reach_over_the_whole_grid() -> None:
     assert SHADOW_REACH % SHADOW_CELL == 0
 
 
-def test_same_bits_twice(session: runtime.Session) -> None:
+def test_same_bits_twice(session: opencl.Session) -> None:
     solids = objects.tree(np.random.default_rng(0)), objects.car(np.random.default_rng(1))
     placed = [objects.placed(part, x, 0.0, 9.0, 0.3) for part, x in zip(solids, (1.5, -1.5), strict=True)]
     for samples in (1, 2):

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import vestcl
+from vestcl import opencl
 from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
 from vestcl.data.street.raycast import FOREGROUND
 from vestcl.data.street.street import CAMERA_HEIGHT
 from vestcl.io.labels import background
-from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH = 96, 320
 
@@ -34,7 +34,7 @@ def shift(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
     return moved
 
 
-def test_shapes_and_ranges(session: runtime.Session) -> None:
+def test_shapes_and_ranges(session: opencl.Session) -> None:
     frame = look(Street.generate(0))
     assert frame.colour.shape == (1, 3, HEIGHT, WIDTH)
     assert frame.depth.shape == frame.labels.shape == (1, 1, HEIGHT, WIDTH)
@@ -44,14 +44,14 @@ def test_shapes_and_ranges(session: runtime.Session) -> None:
     assert {Label.ROAD, Label.SIDEWALK, Label.BUILDING, Label.SKY, Label.CAR} <= set(np.unique(frame.labels))
 
 
-def test_seed_decides(session: runtime.Session) -> None:
+def test_seed_decides(session: opencl.Session) -> None:
     first, again, other = (look(Street.generate(seed)) for seed in (3, 3, 4))
     assert np.array_equal(first.colour, again.colour)
     assert np.array_equal(first.depth, again.depth)
     assert not np.array_equal(first.colour, other.colour)
 
 
-def test_depth_of_the_road_by_hand(session: runtime.Session) -> None:
+def test_depth_of_the_road_by_hand(session: opencl.Session) -> None:
     """A level camera sees flat road at z = h f / (v - cy)."""
     level = shift(x=-1.6, y=CAMERA_HEIGHT)
     frame, K = look(Street.generate(0), camera_from_world=level), intrinsics(HEIGHT, WIDTH)
@@ -62,13 +62,13 @@ def test_depth_of_the_road_by_hand(session: runtime.Session) -> None:
     assert np.abs(frame.depth[0, 0][rows, columns][near] / by_hand[near] - 1).max() < 1e-3
 
 
-def test_sky_is_far_and_only_sky_is(session: runtime.Session) -> None:
+def test_sky_is_far_and_only_sky_is(session: opencl.Session) -> None:
     frame = look(Street.generate(1))
     assert np.array_equal(frame.depth == SKY_DEPTH, frame.labels == Label.SKY)
     assert frame.depth.min() > 0.1
 
 
-def test_a_camera_on_the_right_sees_things_further_left(session: runtime.Session) -> None:
+def test_a_camera_on_the_right_sees_things_further_left(session: opencl.Session) -> None:
     """Points of the first camera, projected into the second, lie at the depth that is rendered there."""
     street, K = Street.generate(0), torch.from_numpy(intrinsics(HEIGHT, WIDTH)).float()[None]
     tgt_from_cam = shift(x=-0.5, z=-0.8)
@@ -86,7 +86,7 @@ def test_a_camera_on_the_right_sees_things_further_left(session: runtime.Session
     assert float((colours - matched).abs().median()) < 0.03
 
 
-def test_time_moves_cars_and_nothing_else(session: runtime.Session) -> None:
+def test_time_moves_cars_and_nothing_else(session: opencl.Session) -> None:
     now, later = look(Street.generate(0)), look(Street.generate(0), t=0.4)
     changed = np.abs(now.depth - later.depth) > 0.05
     assert changed.any()
@@ -96,7 +96,7 @@ def test_time_moves_cars_and_nothing_else(session: runtime.Session) -> None:
     assert np.array_equal(now.depth[building], later.depth[building])
 
 
-def test_batches_are_single_frames(session: runtime.Session) -> None:
+def test_batches_are_single_frames(session: opencl.Session) -> None:
     street = Street.generate(2)
     poses = np.stack([np.linalg.inv(street.camera_pose(t)) for t in (0.0, 0.5)])
     both = look(street, camera_from_world=poses, t=np.array([0.0, 0.5]))
@@ -107,7 +107,7 @@ def test_batches_are_single_frames(session: runtime.Session) -> None:
 
 
 def film_curve(light: np.ndarray) -> np.ndarray:
-    """Linear light to a display's [0, 1], as `display` in kernels/raycast_light.h."""
+    """Linear light to a display's [0, 1], as `display` in kernels/raycast/raycast_light.h."""
     x = 0.7 * np.maximum(light, 0)
     return np.sqrt(np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1))
 
@@ -120,7 +120,7 @@ def light_of(colour: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("samples", [2, 3])
-def test_samples_are_averaged_in_linear_light(session: runtime.Session, samples: int) -> None:
+def test_samples_are_averaged_in_linear_light(session: opencl.Session, samples: int) -> None:
     """A picture ``samples`` times as large has one pixel for each ray."""
     street, size = Street.generate(1), (24, 80)
     small = look(street, K=intrinsics(*size), height=size[0], width=size[1], samples=samples)
@@ -140,7 +140,7 @@ def test_samples_are_averaged_in_linear_light(session: runtime.Session, samples:
     assert np.abs(display_mean - small.colour[0]).mean() > 4 * error.mean()
 
 
-def test_samples_change_nothing_but_colour(session: runtime.Session) -> None:
+def test_samples_change_nothing_but_colour(session: opencl.Session) -> None:
     one, four = look(Street.generate(0)), look(Street.generate(0), samples=4)
     assert np.array_equal(one.depth, four.depth)
     assert np.array_equal(one.labels, four.labels)
@@ -153,7 +153,7 @@ def test_foreground_is_what_the_labels_say() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 5])
-def test_background_without_foreground(session: runtime.Session, seed: int) -> None:
+def test_background_without_foreground(session: opencl.Session, seed: int) -> None:
     """Bit for bit the whole street's where no foreground is, but for its shadows, and never nearer behind it."""
     whole, bare = look(Street.generate(seed)), look(Street.generate(seed), foreground=False)
     assert background(bare.labels).all()
@@ -169,7 +169,7 @@ def test_background_without_foreground(session: runtime.Session, seed: int) -> N
     assert np.array_equal(whole.colour[0][:, far[0, 0]], bare.colour[0][:, far[0, 0]])
 
 
-def test_instances_are_cars_and_people(session: runtime.Session) -> None:
+def test_instances_are_cars_and_people(session: opencl.Session) -> None:
     street = Street.generate(1)
     frame, later = look(street, instances=True), look(street, t=0.1, instances=True)
     plain = look(street)

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vestcl import opencl
 from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
 from vestcl.data.calibration import invert, translation
 from vestcl.data.street import clip as street_clip
-from vestcl.opencl import session as runtime
 from vestcl.scene.depth.stereo import stereo_depth
 
 HEIGHT, WIDTH = 48, 160
@@ -24,7 +24,7 @@ def _fresh() -> Iterator[None]:
     street_clip._rendered.cache_clear()
 
 
-def test_frames_are_the_streets(session: runtime.Session) -> None:
+def test_frames_are_the_streets(session: opencl.Session) -> None:
     street = Street.generate(2)
     clip = street.clip(3, HEIGHT, WIDTH, start=1.0, fps=5.0, baseline=0.6, samples=2)
     assert len(clip) == 3
@@ -45,7 +45,7 @@ def test_frames_are_the_streets(session: runtime.Session) -> None:
         assert np.array_equal(sample.right.K, sample.K)
 
 
-def test_every_picture_is_rendered_once(session: runtime.Session) -> None:
+def test_every_picture_is_rendered_once(session: opencl.Session) -> None:
     clip = Street.generate(0).clip(2, HEIGHT, WIDTH)
     rendered = street_clip._rendered.cache_info
     assert rendered().misses == 0
@@ -60,7 +60,7 @@ def test_every_picture_is_rendered_once(session: runtime.Session) -> None:
     assert rendered().misses == 3
 
 
-def test_reads_as_any_clip(session: runtime.Session) -> None:
+def test_reads_as_any_clip(session: opencl.Session) -> None:
     clip = Street.generate(1).clip(3, HEIGHT, WIDTH)
     labels, depth = clip[0].read_labels(), clip[0].read_depth()
     assert np.array_equal(depth == SKY_DEPTH, labels == Label.SKY)
@@ -77,7 +77,7 @@ def test_reads_as_any_clip(session: runtime.Session) -> None:
     assert np.array_equal(again[2].read_image(), clip[2].read_image())
 
 
-def test_background_clip(session: runtime.Session) -> None:
+def test_background_clip(session: opencl.Session) -> None:
     street = Street.generate(3)
     whole, bare = street.clip(1, HEIGHT, WIDTH)[0], street.clip(1, HEIGHT, WIDTH, foreground=False)[0]
     assert bare.read_mask().all()
@@ -86,7 +86,7 @@ def test_background_clip(session: runtime.Session) -> None:
     assert np.array_equal(whole.read_depth()[seen], bare.read_depth()[seen])
 
 
-def test_motion_between_samples(session: runtime.Session) -> None:
+def test_motion_between_samples(session: opencl.Session) -> None:
     """Poses and times of the samples are all that `Street.motion` asks for."""
     street = Street.generate(0)
     cur, after = street.clip(2, HEIGHT, WIDTH)
@@ -97,7 +97,7 @@ def test_motion_between_samples(session: runtime.Session) -> None:
     np.testing.assert_allclose(displacement[2][road].mean(), -ahead, rtol=0.1)
 
 
-def test_stereo_finds_the_depth(session: runtime.Session) -> None:
+def test_stereo_finds_the_depth(session: opencl.Session) -> None:
     """The pair is textured and rectified: semi-global matching gets its depth."""
     sample = Street.generate(0).clip(1, 128, 416, samples=2)[0]
     right = sample.right

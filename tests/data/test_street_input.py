@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vestcl import opencl
 from vestcl.cli import main as cli
 from vestcl.cli.prepare import open_input, plan
 from vestcl.data import SKY_DEPTH, Label, Street
@@ -17,7 +18,6 @@ from vestcl.data.street.driving.road import RoadDrive
 from vestcl.data.street.input import Driven, parse
 from vestcl.data.street.raycast import FOREGROUND
 from vestcl.data.street.sensors import DisturbedLabels, StreetScan
-from vestcl.opencl import session as runtime
 from vestcl.prepare.clip import frame_keys
 from vestcl.prepare.prepared import find_prepared
 
@@ -105,7 +105,7 @@ def test_evaluation_and_forecast_take_the_drive(capsys: pytest.CaptureFixture[st
 # ---------------------------------------------------------------- sensors
 
 
-def test_a_scan_is_sparse_and_true(session: runtime.Session) -> None:
+def test_a_scan_is_sparse_and_true(session: opencl.Session) -> None:
     shot = Shot(Street.generate(3), 1.0, 0.0, (128, 416), 1, True)
     truth = shot.take().depth[0]
     shares = []
@@ -122,7 +122,7 @@ def test_a_scan_is_sparse_and_true(session: runtime.Session) -> None:
     assert not np.array_equal(StreetScan(shot, 64, 1).read(), StreetScan(shot, 64, 0).read())
 
 
-def test_disturbed_labels_are_nearly_right(session: runtime.Session) -> None:
+def test_disturbed_labels_are_nearly_right(session: opencl.Session) -> None:
     shot = Shot(Street.generate(3), 1.0, 0.0, (128, 416), 1, True)
     truth, missed, off = shot.take().labels[0], 0, 0
     front = np.isin(truth, FOREGROUND)
@@ -139,7 +139,7 @@ def test_disturbed_labels_are_nearly_right(session: runtime.Session) -> None:
     np.testing.assert_array_equal(DisturbedLabels(shot, 4).read(), DisturbedLabels(shot, 4).read())
 
 
-def test_each_source_is_prepared(session: runtime.Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_source_is_prepared(session: opencl.Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every depth and mask source gives frames, and all have the right camera's images as targets."""
     inputs = [f"street:5?drive=road,fps=20,depth={d},masks={m}" for d, m in
               (("motion", "motion"), ("scan", "disturbed"), ("stereo", "true"))]  # fmt: skip

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vestcl import opencl
 from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
 from vestcl.data.street.driving.drive import world_from_camera
-from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH = 96, 320
 K = intrinsics(HEIGHT, WIDTH)
@@ -39,7 +39,7 @@ def apply(dst_from_src: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", [0, 3])
-def test_what_stands_moves_rigidly(session: runtime.Session, seed: int) -> None:
+def test_what_stands_moves_rigidly(session: opencl.Session, seed: int) -> None:
     street = Street.generate(seed)
     frame, displacement = look(street, 1.0), move(street, 1.0, 1.0 + STEP)
     assert displacement.shape == (3, HEIGHT, WIDTH)
@@ -54,7 +54,7 @@ def test_what_stands_moves_rigidly(session: runtime.Session, seed: int) -> None:
     assert np.linalg.norm(displacement[:, moving] - rigid[:, moving], axis=0).min() > 0.05
 
 
-def test_the_sky_only_turns(session: runtime.Session) -> None:
+def test_the_sky_only_turns(session: opencl.Session) -> None:
     street = Street.generate(1)
     frame = look(street, 0.0)
     sky = frame.labels[0, 0] == Label.SKY
@@ -69,7 +69,7 @@ def test_the_sky_only_turns(session: runtime.Session) -> None:
     np.testing.assert_allclose(move(street, 0.0, STEP, after=turn @ cur)[:, sky], turned[:, sky], atol=1e-3)
 
 
-def test_cars_and_people_by_hand(session: runtime.Session) -> None:
+def test_cars_and_people_by_hand(session: opencl.Session) -> None:
     """A camera that stands still and looks along the road sees only u_z, each file's own speed."""
     street = Street.generate(0)
     level = np.eye(4)
@@ -87,7 +87,7 @@ def test_cars_and_people_by_hand(session: runtime.Session) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 2])
-def test_what_moved_is_found_where_it_should_be(session: runtime.Session, seed: int) -> None:
+def test_what_moved_is_found_where_it_should_be(session: opencl.Session, seed: int) -> None:
     """x + u, projected into the next camera, lies at the depth that is rendered there, on the same car or person."""
     street, found, asked = Street.generate(seed), 0, 0
     for t in (0.0, 1.5):
@@ -107,7 +107,7 @@ def test_what_moved_is_found_where_it_should_be(session: runtime.Session, seed: 
     assert found / asked > 0.9
 
 
-def test_there_and_back(session: runtime.Session) -> None:
+def test_there_and_back(session: opencl.Session) -> None:
     """The time may run backwards: seen from one camera, what a car does in a step it undoes in the step back."""
     street, pose = Street.generate(4), camera(Street.generate(4), 0.0)
     forth, back = (move(street, 0.0, t, cur=pose, after=pose) for t in (0.01, -0.01))
@@ -115,7 +115,7 @@ def test_there_and_back(session: runtime.Session) -> None:
     assert np.abs(forth).max() > 0.05
 
 
-def test_same_bits_twice(session: runtime.Session) -> None:
+def test_same_bits_twice(session: opencl.Session) -> None:
     assert np.array_equal(move(Street.generate(6), 2.0, 2.1), move(Street.generate(6), 2.0, 2.1))
 
 

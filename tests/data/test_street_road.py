@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vestcl import opencl
 from vestcl.data import Label, Street, intrinsics
 from vestcl.data.street.bent import world_from_street
 from vestcl.data.street.driving import profile as street_profile
@@ -15,7 +16,6 @@ from vestcl.data.street.driving.drive import Sway
 from vestcl.data.street.driving.road import JERK, RoadDrive
 from vestcl.data.street.layout import BLOCK, Layout, anchored_block, block
 from vestcl.data.street.raycast import Material
-from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH = 64, 208
 K = intrinsics(HEIGHT, WIDTH)
@@ -163,7 +163,7 @@ def test_cars_keep_their_lanes_and_their_distance() -> None:
 
 
 @pytest.mark.parametrize(("seed", "t"), [(3, 10.0), (9, 30.0)])
-def test_depth_poses_and_motion_agree_with_the_images(session: runtime.Session, seed: int, t: float) -> None:
+def test_depth_poses_and_motion_agree_with_the_images(session: opencl.Session, seed: int, t: float) -> None:
     """What frame t shows, moved as `motion` says, is what is seen there at t + 0.1 s; of static parts rigidly so."""
     street, cameras = road(seed), []
     roll = np.eye(4)
@@ -198,7 +198,7 @@ def test_depth_poses_and_motion_agree_with_the_images(session: runtime.Session, 
     assert (again == now.instances[0, 0].reshape(-1)[dynamic]).mean() > 0.9
 
 
-def test_textures_stay_on_the_road(session: runtime.Session) -> None:
+def test_textures_stay_on_the_road(session: opencl.Session) -> None:
     """Seen straight down from 6 and 7 m, the road has the same colours: its texture does not follow the camera."""
     street, t, side = road(9), 30.0, 120
     assert street.course is not None

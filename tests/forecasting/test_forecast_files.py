@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vestcl import __version__
+from vestcl import __version__, opencl
 from vestcl.data.calibration import translation
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageArray
@@ -17,7 +17,6 @@ from vestcl.forecasting.result import Forecast, Rendered, Skipped, View
 from vestcl.forecasting.views import parse_views
 from vestcl.io.images import to_float
 from vestcl.io.video.reading import Video
-from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH = 24, 40
 K = np.array([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
@@ -198,7 +197,7 @@ def test_report_rises_to_one(tmp_path: Path) -> None:
     assert shares == [0.5, 1]
 
 
-def test_machine_tells_what_is_in_use(session: runtime.Session) -> None:
+def test_machine_tells_what_is_in_use(session: opencl.Session) -> None:
     told = machine()
     assert told["versions"]["vestcl"] == __version__
     assert all(told["versions"][name] for name in ("python", "numpy", "torch", "opencv", "pyopencl"))

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from vestcl.opencl import session as runtime
+from vestcl import opencl
 
 #: What forks, and says how each child ended: "passed", the error that it got, or "hangs".
 COMMON = """
 import os, signal, sys
 import vestcl
-from vestcl import runtime
+from vestcl import opencl
 
 def in_child(name, work):
     reading, writing = os.pipe()
@@ -39,9 +39,9 @@ DEVICES_ONLY = """
 in_child("before", vestcl.devices)
 vestcl.devices()
 in_child("devices", vestcl.devices)
-in_child("select", lambda: runtime.select("pocl"))
+in_child("select", lambda: opencl.select("pocl"))
 in_child("use", lambda: vestcl.use("pocl"))
-in_child("current", runtime.current)
+in_child("current", opencl.current)
 in_child("exit", lambda: None)
 in_child("free", vestcl.free_memory)
 in_child("grandchild", lambda: in_child("child's child", vestcl.devices))
@@ -59,7 +59,7 @@ def street():
     scene.render(np.linalg.inv(scene.camera_pose(2.0)), intrinsics(20, 37), 20, 37, 2.0)
 
 wanted = unproject()
-session = runtime.current()
+session = opencl.current()
 points = [torch.rand(1, 9, 2) * 16, torch.rand(1, 9) + 1, torch.rand(1, 9) + 1, torch.rand(1, 9)]
 raster = vestcl.rasterize(*points, 16, 16)
 required = depth.clone().requires_grad_()
@@ -103,7 +103,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system doe
 
 def ends(code: str) -> dict[str, tuple[str, str]]:
     """Name -> what the child said, and its exit status."""
-    environment = os.environ | {"PYTHONPATH": str(Path(runtime.__file__).parents[2])}
+    environment = os.environ | {"PYTHONPATH": str(Path(opencl.__file__).parents[2])}
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", COMMON + code],
         capture_output=True, text=True, env=environment, timeout=300, check=False,

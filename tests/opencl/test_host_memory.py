@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 import vestcl
-from vestcl import constants
+from vestcl import constants, opencl
 from vestcl.opencl import host_memory
-from vestcl.opencl import session as runtime
 
 MIB = 1 << 20
 
@@ -88,7 +87,7 @@ def test_what_is_kept_is_bounded_and_shrinks(pool: host_memory._HostPool, monkey
     assert pool.free_bytes <= 4.1 * MIB
 
 
-def test_free_memory_gives_all_back(pool: host_memory._HostPool, session: runtime.Session) -> None:
+def test_free_memory_gives_all_back(pool: host_memory._HostPool, session: opencl.Session) -> None:
     with session.job() as job:
         job.scratch(1 << 20, np.uint8)
     kept = filled(MIB, 3)

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from vestcl import opencl
 from vestcl.opencl import icd
-from vestcl.opencl import session as runtime
 
 
 @pytest.fixture
@@ -71,11 +71,11 @@ def test_a_broken_linker_is_named(
     linker.write_bytes(b"\0\0" if script is None else f"#!/bin/sh\n{script}\n".encode())
     linker.chmod(0o755)
     assert icd.linker_fault() == ""
-    info = runtime.select("pocl")
+    info = opencl.select("pocl")
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     assert f"{linker} does not work ({fault})" in icd.linker_fault()
-    with pytest.raises(runtime.DeviceError, match="apt install binutils"):
-        runtime.open_session.__wrapped__(info, "tile")
+    with pytest.raises(opencl.DeviceError, match="apt install binutils"):
+        opencl.open_session.__wrapped__(info, "tile")
 
 
 # ---------------------------------------------------------------- Intel's runtime

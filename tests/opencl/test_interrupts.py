@@ -16,7 +16,7 @@ import torch
 from test_robust_lock import abandon
 
 import vestcl
-from vestcl.opencl import session as runtime
+from vestcl import opencl
 from vestcl.ops import unproject
 
 #: Whose bytecodes count.
@@ -116,7 +116,7 @@ def right(call: Callable[[], list[torch.Tensor]]) -> Callable[[], None]:
     return check
 
 
-def test_a_small_operator_stopped_at_every_bytecode(session: runtime.Session) -> None:
+def test_a_small_operator_stopped_at_every_bytecode(session: opencl.Session) -> None:
     depth, K = torch.rand(1, 1, 8, 8) + 1, torch.eye(3)[None]
 
     def nested() -> list[torch.Tensor]:
@@ -133,12 +133,12 @@ def test_splatting_stopped_at_many_bytecodes() -> None:
     assert_survives(splatting(6000, 16, 80), right(splatting(300, 4, 32)), 101)
 
 
-def test_profiles_and_observers_stopped_at_every_bytecode(session: runtime.Session) -> None:
+def test_profiles_and_observers_stopped_at_every_bytecode(session: opencl.Session) -> None:
     depth, K = torch.rand(1, 1, 8, 8) + 1, torch.eye(3)[None]
 
     def observed() -> tuple[int, int]:
-        seen: list[runtime.JobTimes] = []
-        with observing, runtime.observe(seen.append), session.profile() as times:
+        seen: list[opencl.JobTimes] = []
+        with observing, opencl.observe(seen.append), session.profile() as times:
             vestcl.unproject(depth, K)
         return len(seen), len(times)
 
@@ -151,10 +151,10 @@ def test_profiles_and_observers_stopped_at_every_bytecode(session: runtime.Sessi
 
 def test_building_a_kernel_stopped_at_many_bytecodes() -> None:
     depth, inverse_K = np.ones((1, 1, 2, 2), np.float32), np.eye(3, dtype=np.float32)[None]
-    given = runtime.current()
+    given = opencl.current()
 
     def work() -> None:
-        session = runtime.Session(given.info, given.mapping, given._device)
+        session = opencl.Session(given.info, given.mapping, given._device)
         for _ in range(2):
             with contextlib.suppress(Stopped):  # once of the two times
                 assert unproject._forward(session, depth, inverse_K)[0, -1].tolist() == [1.5, 1.5, 1]
@@ -171,12 +171,12 @@ def test_building_a_kernel_stopped_at_many_bytecodes() -> None:
 
 def test_arrays_outlive_the_kernels_of_an_interrupted_job() -> None:
     """The end of the job is lost, and with it all that held the arrays; the next job waits before it lets them go."""
-    session = runtime.current()
+    session = opencl.current()
     array, result = np.ones((1, 1, 64, 64), np.float32), np.empty((1, 4096, 3), np.float32)
     job = abandon(session.job())
     arguments = [np.int32(64), np.int32(64), np.int32(64), job.read(array), job.read(np.eye(3, dtype=np.float32))]
     job.launch(
-        "unproject.cl", "unproject", runtime.defines_for(array.dtype), (1, 64, 1), [*arguments, job.write(result)]
+        "unproject.cl", "unproject", opencl.defines_for(array.dtype), (1, 64, 1), [*arguments, job.write(result)]
     )
     held = [id(bound) for _, bound in session._bound]
     assert id(array) in held and id(result) in held
@@ -186,12 +186,12 @@ def test_arrays_outlive_the_kernels_of_an_interrupted_job() -> None:
 
 
 def test_use_ends_with_its_block_though_interrupted() -> None:
-    before = runtime.current()
+    before = opencl.current()
     assert abandon(vestcl.use(mapping="pixel")).mapping == "pixel"
-    assert runtime.current() is before
+    assert opencl.current() is before
     with vestcl.use(mapping="pixel") as chosen:
-        assert runtime.current() is chosen
-    assert runtime.current() is before
+        assert opencl.current() is chosen
+    assert opencl.current() is before
 
 
 def test_use_without_a_block_goes_on() -> None:
@@ -200,26 +200,26 @@ def test_use_without_a_block_goes_on() -> None:
     def choose() -> None:
         for _ in range(3):
             kept = vestcl.use(mapping="pixel")
-        assert runtime.current().mapping == "pixel"
-        assert kept.__exit__ is not None and runtime.current().mapping == "pixel"
+        assert opencl.current().mapping == "pixel"
+        assert kept.__exit__ is not None and opencl.current().mapping == "pixel"
         for _ in range(2):
             with vestcl.use(mapping="tile"), contextlib.ExitStack() as stack:
                 stack.enter_context(vestcl.use(mapping="pixel"))
                 abandon(vestcl.use(mapping="tile"))
-                assert runtime.current().mapping == "pixel"
+                assert opencl.current().mapping == "pixel"
                 stack.close()
-                assert runtime.current().mapping == "tile"
-            assert runtime.current() is kept.session
+                assert opencl.current().mapping == "tile"
+            assert opencl.current() is kept.session
         assert kept._before is None, "a chain of all calls would be a leak"
 
     contextvars.copy_context().run(choose)
 
 
 def test_an_interrupted_observer_hears_no_more() -> None:
-    lost: list[runtime.JobTimes] = []
-    heard: list[runtime.JobTimes] = []
-    abandon(runtime.observe(lost.append))
-    with runtime.observe(heard.append):
+    lost: list[opencl.JobTimes] = []
+    heard: list[opencl.JobTimes] = []
+    abandon(opencl.observe(lost.append))
+    with opencl.observe(heard.append):
         vestcl.unproject(np.ones((1, 1, 2, 2)), np.eye(3)[None])
     assert len(heard) == 1 and not lost
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from vestcl import opencl
 from vestcl.cli import interrupt
 from vestcl.opencl import icd, pocl_cache
-from vestcl.opencl import session as runtime
 
 ROOT = Path(__file__).resolve().parents[2]
 OPERATOR = """
@@ -81,8 +81,8 @@ def test_without_any_space_it_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
     assert "can't be used (Disk quota exceeded), nor a temporary one in" in fault
     assert "let POCL_CACHE_DIR name a folder" in fault
     assert icd.no_device() == f"no OpenCL device: {fault}"
-    with pytest.raises(runtime.DeviceError, match="let POCL_CACHE_DIR name a folder"):
-        runtime.open_session.__wrapped__(runtime.select("pocl"), "tile")
+    with pytest.raises(opencl.DeviceError, match="let POCL_CACHE_DIR name a folder"):
+        opencl.open_session.__wrapped__(opencl.select("pocl"), "tile")
 
 
 def test_a_disk_that_becomes_full(monkeypatch: pytest.MonkeyPatch) -> None:

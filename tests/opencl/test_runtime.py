@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl.opencl import session as runtime
+from vestcl import opencl
+from vestcl.opencl import device_list, programs
+from vestcl.opencl import session as session_module
 
 SCALE = """
 kernel void scale(const REAL factor, global const REAL* in, global REAL* out)
@@ -35,22 +37,23 @@ def _no_chosen_device(monkeypatch: pytest.MonkeyPatch) -> None:
 def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A kernel folder with scale.cl, in place of vestcl's."""
     (tmp_path / "scale.cl").write_text(SCALE)
-    monkeypatch.setattr(runtime, "kernel_folder", lambda: tmp_path)
-    monkeypatch.setattr(runtime, "source", runtime.source.__wrapped__)  # its cache knows file names alone
+    monkeypatch.setattr(programs, "kernel_folder", lambda: tmp_path)
+    for module in (programs, session_module):
+        monkeypatch.setattr(module, "source", opencl.source.__wrapped__)  # its cache knows file names alone
     return tmp_path
 
 
 @pytest.fixture
-def fresh(session: runtime.Session) -> runtime.Session:
+def fresh(session: opencl.Session) -> opencl.Session:
     """A session of this test's own, in which nothing is built yet."""
-    return runtime.Session(session.info, session.mapping, session._device)
+    return opencl.Session(session.info, session.mapping, session._device)
 
 
-def scale(session: runtime.Session, factor: float, array: np.ndarray) -> np.ndarray:
+def scale(session: opencl.Session, factor: float, array: np.ndarray) -> np.ndarray:
     result = np.empty_like(array)
     with session.job() as job:
         arguments = [array.dtype.type(factor), job.read(array), job.write(result)]
-        job.launch("scale.cl", "scale", runtime.defines_for(array.dtype), array.shape, arguments)
+        job.launch("scale.cl", "scale", opencl.defines_for(array.dtype), array.shape, arguments)
     return result
 
 
@@ -58,78 +61,78 @@ def scale(session: runtime.Session, factor: float, array: np.ndarray) -> np.ndar
 
 
 def test_default_is_a_cpu_of_pocl() -> None:
-    info = runtime.select()
+    info = opencl.select()
     assert info.kind == "CPU"
     assert "PoCL" in info.version
 
 
 def test_select_by_index_and_by_any_part_of_a_name() -> None:
-    for info in runtime.devices():
-        assert runtime.select(info.index) == info
-        assert info.platform == runtime.select(info.platform.upper()).platform
-        assert info.name == runtime.select(info.name[2:].lower()).name
-    assert "PoCL 3.0" in runtime.select("pocl 3.0").driver  # pip's, beside whichever the system has
+    for info in opencl.devices():
+        assert opencl.select(info.index) == info
+        assert info.platform == opencl.select(info.platform.upper()).platform
+        assert info.name == opencl.select(info.name[2:].lower()).name
+    assert "PoCL 3.0" in opencl.select("pocl 3.0").driver  # pip's, beside whichever the system has
 
 
 def test_select_by_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    last = runtime.devices()[-1]
+    last = opencl.devices()[-1]
     monkeypatch.setenv("VESTCL_DEVICE", last.index)
-    assert runtime.select() == last
-    assert runtime.current().info == last
-    assert runtime.select(runtime.devices()[0].index) == runtime.devices()[0]  # an argument outweighs it
+    assert opencl.select() == last
+    assert opencl.current().info == last
+    assert opencl.select(opencl.devices()[0].index) == opencl.devices()[0]  # an argument outweighs it
 
 
 @pytest.mark.parametrize("selector", ["no such device", "99:0"])
 def test_unknown_device_lists_those_that_there_are(selector: str) -> None:
-    with pytest.raises(runtime.DeviceError, match=selector) as caught:
-        runtime.select(selector)
-    for info in runtime.devices():
+    with pytest.raises(opencl.DeviceError, match=selector) as caught:
+        opencl.select(selector)
+    for info in opencl.devices():
         assert f"{info.index} {info.platform} / {info.name}" in str(caught.value)
 
 
 def test_no_device_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runtime, "devices", list)
-    with pytest.raises(runtime.DeviceError, match=r"pip install 'pyopencl\[pocl\]'"):
-        runtime.select()
+    monkeypatch.setattr(device_list, "devices", list)
+    with pytest.raises(opencl.DeviceError, match=r"pip install 'pyopencl\[pocl\]'"):
+        opencl.select()
 
 
 def test_use_holds_inside_a_with_block() -> None:
-    before = runtime.current()
-    last = runtime.devices()[-1].index
-    with runtime.use(last, mapping="pixel") as outer:
-        assert outer is runtime.current()
+    before = opencl.current()
+    last = opencl.devices()[-1].index
+    with opencl.use(last, mapping="pixel") as outer:
+        assert outer is opencl.current()
         assert (outer.info.index, outer.mapping) == (last, "pixel")
-        with runtime.use(mapping="tile") as inner:
-            assert inner is runtime.current() is not outer
-        assert runtime.current() is outer
-    assert runtime.current() is before
+        with opencl.use(mapping="tile") as inner:
+            assert inner is opencl.current() is not outer
+        assert opencl.current() is outer
+    assert opencl.current() is before
 
 
 def test_use_sets_from_here_on() -> None:
     def choose() -> str:
-        runtime.use(mapping="pixel")
-        return runtime.current().mapping
+        opencl.use(mapping="pixel")
+        return opencl.current().mapping
 
     assert contextvars.copy_context().run(choose) == "pixel"
-    assert runtime.current().mapping == "tile"
+    assert opencl.current().mapping == "tile"
 
 
 def test_use_checks_the_mapping() -> None:
     with pytest.raises(ValueError, match="`mapping` must be 'tile', 'pixel' or None, got 'row'"):
-        runtime.use(mapping="row")
+        opencl.use(mapping="row")
 
 
 def test_pocl_without_a_linker_names_the_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    info = runtime.select("pocl")
+    info = opencl.select("pocl")
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(runtime.DeviceError, match="apt install binutils"):
-        runtime.open_session.__wrapped__(info, "tile")
+    with pytest.raises(opencl.DeviceError, match="apt install binutils"):
+        opencl.open_session.__wrapped__(info, "tile")
 
 
 # ---------------------------------------------------------------- programs
 
 
-def test_a_program_is_built_once(kernels: Path, fresh: runtime.Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_is_built_once(kernels: Path, fresh: opencl.Session, monkeypatch: pytest.MonkeyPatch) -> None:
     builds: list[Any] = []
     build = fresh._build
 
@@ -138,7 +141,7 @@ def test_a_program_is_built_once(kernels: Path, fresh: runtime.Session, monkeypa
         return build(*arguments)
 
     monkeypatch.setattr(fresh, "_build", counted)
-    defines = runtime.defines_for(np.dtype(np.float32))
+    defines = opencl.defines_for(np.dtype(np.float32))
     first = fresh.kernel("scale.cl", "scale", defines)
     assert fresh.kernel("scale.cl", "scale", dict(reversed(defines.items()))) is first
     assert fresh.kernel("scale.cl", "add_one", defines) is not first
@@ -148,49 +151,49 @@ def test_a_program_is_built_once(kernels: Path, fresh: runtime.Session, monkeypa
 
 
 @pytest.mark.parametrize("broken", ["broken.cl", "part.h"])
-def test_a_build_error_points_to_file_and_line(kernels: Path, fresh: runtime.Session, broken: str) -> None:
+def test_a_build_error_points_to_file_and_line(kernels: Path, fresh: opencl.Session, broken: str) -> None:
     lines = {"part.h": "#define PART 1\n", "broken.cl": '\n#include "part.h"\n\nkernel void nothing() {}\n'}
     lines[broken] += "nonsense;\n"
     for name, text in lines.items():
         (kernels / name).write_text(text)
     line = lines[broken].count("\n")
-    with pytest.raises(runtime.DeviceError, match=rf"(?s)broken.cl does not build on .*REAL=float.*{broken}:{line}:"):
+    with pytest.raises(opencl.DeviceError, match=rf"(?s)broken.cl does not build on .*REAL=float.*{broken}:{line}:"):
         fresh.kernel("broken.cl", "nothing", {"REAL": "float"})
 
 
-def test_float64_on_a_device_without_it(kernels: Path, fresh: runtime.Session) -> None:
+def test_float64_on_a_device_without_it(kernels: Path, fresh: opencl.Session) -> None:
     fresh.info = dataclasses.replace(fresh.info, float64=False)
     assert scale(fresh, 2, np.ones(3, np.float32)).tolist() == [2, 2, 2]
-    with pytest.raises(runtime.DeviceError, match="has no float64: pass float32"):
+    with pytest.raises(opencl.DeviceError, match="has no float64: pass float32"):
         scale(fresh, 2, np.ones(3))
 
 
 def test_missing_kernels_name_the_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(runtime, "__file__", str(tmp_path / "vestcl" / "runtime.py"))
-    with pytest.raises(runtime.DeviceError, match="install the package again"):
-        runtime.kernel_folder.__wrapped__()
+    monkeypatch.setattr(programs, "__file__", str(tmp_path / "vestcl" / "opencl" / "programs.py"))
+    with pytest.raises(opencl.DeviceError, match="install the package again"):
+        opencl.kernel_folder.__wrapped__()
 
 
 def test_every_kernel_file_is_found_and_inlined() -> None:
-    files = [*runtime.kernel_folder().glob("*.cl")]
+    files = [*opencl.kernel_folder().rglob("*.cl")]
     assert {"splat_composite.cl", "unproject.cl"} <= {file.name for file in files}
     for file in files:
-        assert '#include "' not in runtime.source(file.name)
+        assert '#include "' not in opencl.source(file.relative_to(opencl.kernel_folder()).as_posix())
 
 
 # ---------------------------------------------------------------- jobs
 
 
-def test_results_arrive(kernels: Path, fresh: runtime.Session) -> None:
+def test_results_arrive(kernels: Path, fresh: opencl.Session) -> None:
     array = np.arange(1000, dtype=np.float32)
     np.testing.assert_array_equal(scale(fresh, 0.5, array), array / 2)
     fresh.shares_host_memory = False  # copies, as for a GPU
     np.testing.assert_array_equal(scale(fresh, 0.25, array), array / 4)
 
 
-def test_results_of_one_launch_feed_the_next(kernels: Path, fresh: runtime.Session) -> None:
+def test_results_of_one_launch_feed_the_next(kernels: Path, fresh: opencl.Session) -> None:
     array, result = np.arange(5, dtype=np.float32), np.empty(5, np.float32)
-    defines = runtime.defines_for(array.dtype)
+    defines = opencl.defines_for(array.dtype)
     with fresh.job() as job:
         between = job.scratch(array.size, array.dtype)
         job.launch("scale.cl", "scale", defines, array.shape, [np.float32(3), job.read(array), between])
@@ -199,25 +202,25 @@ def test_results_of_one_launch_feed_the_next(kernels: Path, fresh: runtime.Sessi
         assert result.tolist() == [1, 4, 7, 10, 13]
 
 
-def test_a_cpu_reads_the_array_itself(kernels: Path, fresh: runtime.Session) -> None:
+def test_a_cpu_reads_the_array_itself(kernels: Path, fresh: opencl.Session) -> None:
     if fresh.info.kind != "CPU":
         pytest.skip("this device has a memory of its own")
     array, result = np.ones(8, np.float32), np.empty(8, np.float32)
     with fresh.job() as job:
         arguments: list[Any] = [np.float32(2), job.read(array), job.write(result)]
         array[:] = 21  # after `read`: a copy would not see it
-        job.launch("scale.cl", "scale", runtime.defines_for(array.dtype), array.shape, arguments)
+        job.launch("scale.cl", "scale", opencl.defines_for(array.dtype), array.shape, arguments)
     assert result.tolist() == [42] * 8
 
 
-def test_a_failed_job_frees_the_session(kernels: Path, fresh: runtime.Session) -> None:
+def test_a_failed_job_frees_the_session(kernels: Path, fresh: opencl.Session) -> None:
     with pytest.raises(KeyError), fresh.job() as job:
-        job.launch("scale.cl", "no_such_kernel", runtime.defines_for(np.dtype(np.float32)), (1,), [])
+        job.launch("scale.cl", "no_such_kernel", opencl.defines_for(np.dtype(np.float32)), (1,), [])
     with ThreadPoolExecutor(1) as other:
         assert other.submit(scale, fresh, 2, np.ones(1, np.float32)).result(timeout=60) == 2
 
 
-def test_threads_share_a_session(kernels: Path, fresh: runtime.Session) -> None:
+def test_threads_share_a_session(kernels: Path, fresh: opencl.Session) -> None:
     array = np.arange(100, dtype=np.float32)
     with ThreadPoolExecutor(4) as pool:
         results = list(pool.map(lambda factor: scale(fresh, factor, array), range(40)))
@@ -225,7 +228,7 @@ def test_threads_share_a_session(kernels: Path, fresh: runtime.Session) -> None:
         np.testing.assert_array_equal(result, factor * array)
 
 
-def test_profile_times_every_kernel(kernels: Path, fresh: runtime.Session) -> None:
+def test_profile_times_every_kernel(kernels: Path, fresh: opencl.Session) -> None:
     array = np.ones(10_000, np.float32)
     scale(fresh, 1, array)
     with fresh.profile() as times:
@@ -236,11 +239,11 @@ def test_profile_times_every_kernel(kernels: Path, fresh: runtime.Session) -> No
     assert all(0 < time.start_ns <= time.end_ns for time in times)
 
 
-def test_an_observer_hears_of_every_outermost_job(kernels: Path, fresh: runtime.Session) -> None:
+def test_an_observer_hears_of_every_outermost_job(kernels: Path, fresh: opencl.Session) -> None:
     array, heard = np.ones(10_000, np.float32), []
     scale(fresh, 1, array)
     before = time.perf_counter_ns()
-    with runtime.observe(heard.append):
+    with opencl.observe(heard.append):
         scale(fresh, 2, array)
         with fresh.job(), fresh.profile() as times:
             scale(fresh, 3, array)
@@ -258,23 +261,23 @@ def test_an_observer_hears_of_every_outermost_job(kernels: Path, fresh: runtime.
             assert job.start_ns <= launch.start_ns - low and launch.end_ns - high <= job.end_ns
 
 
-def test_an_observer_is_told_the_rest_when_a_job_fails(kernels: Path, fresh: runtime.Session) -> None:
-    heard: list[runtime.JobTimes] = []
-    with runtime.observe(heard.append):
+def test_an_observer_is_told_the_rest_when_a_job_fails(kernels: Path, fresh: opencl.Session) -> None:
+    heard: list[opencl.JobTimes] = []
+    with opencl.observe(heard.append):
         test_a_failed_job_frees_the_session(kernels, fresh)
     assert [len(job.launches) for job in heard] == [1]
 
 
-def test_one_observer_at_a_time(kernels: Path, fresh: runtime.Session) -> None:
-    heard: list[runtime.JobTimes] = []
-    with runtime.observe(heard.append):
-        with pytest.raises(ValueError, match="`observer` must be the only one"), runtime.observe(print):
+def test_one_observer_at_a_time(kernels: Path, fresh: opencl.Session) -> None:
+    heard: list[opencl.JobTimes] = []
+    with opencl.observe(heard.append):
+        with pytest.raises(ValueError, match="`observer` must be the only one"), opencl.observe(print):
             pass
         scale(fresh, 2, np.ones(4, np.float32))
     assert len(heard) == 1
 
 
-def test_clock_bounds_hold_the_devices_clock(fresh: runtime.Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clock_bounds_hold_the_devices_clock(fresh: opencl.Session, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a device without a call for its clock, and of one with it, which is a made-up one."""
     low, high = fresh.clock_bounds()
     assert 0 <= high - low < 10**9
@@ -288,7 +291,7 @@ def test_clock_bounds_hold_the_devices_clock(fresh: runtime.Session, monkeypatch
     assert low <= 10**12 <= high < low + 10**9
 
 
-def test_a_profile_inside_a_job(kernels: Path, fresh: runtime.Session) -> None:
+def test_a_profile_inside_a_job(kernels: Path, fresh: opencl.Session) -> None:
     array = np.ones(10_000, np.float32)
     with fresh.job():
         with fresh.profile() as times:
@@ -298,7 +301,7 @@ def test_a_profile_inside_a_job(kernels: Path, fresh: runtime.Session) -> None:
     assert result[0] == 2 and again[0] == 3
 
 
-def test_a_profile_holds_up_no_other_thread(kernels: Path, fresh: runtime.Session) -> None:
+def test_a_profile_holds_up_no_other_thread(kernels: Path, fresh: opencl.Session) -> None:
     """Nor does it lose kernels: its own, or those of a profile around it."""
     array = np.ones(100, np.float32)
     with ThreadPoolExecutor(1) as other, fresh.profile() as outer:
@@ -311,7 +314,7 @@ def test_a_profile_holds_up_no_other_thread(kernels: Path, fresh: runtime.Sessio
     assert all(0 < one.start_ns <= one.end_ns for one in (*outer, *inner))
 
 
-def test_a_profile_and_an_observer_begin_while_a_job_runs(kernels: Path, fresh: runtime.Session) -> None:
+def test_a_profile_and_an_observer_begin_while_a_job_runs(kernels: Path, fresh: opencl.Session) -> None:
     """In another thread: the profile sees the job's remaining kernels, the observer none of its."""
     array, heard = np.ones(100, np.float32), []
     with ThreadPoolExecutor(1) as other:
@@ -327,22 +330,22 @@ def test_a_profile_and_an_observer_begin_while_a_job_runs(kernels: Path, fresh: 
 
         running = other.submit(work)
         assert begun.wait(60)
-        with runtime.observe(heard.append), fresh.profile() as times:
+        with opencl.observe(heard.append), fresh.profile() as times:
             go_on.set()
             results = running.result(timeout=60)
     assert [result[0] for result in results] == [2, 3, 4]
     assert len(times) == 2 and not heard
 
 
-def test_the_leftovers_of_a_failed_job_inside_another(kernels: Path, fresh: runtime.Session) -> None:
+def test_the_leftovers_of_a_failed_job_inside_another(kernels: Path, fresh: opencl.Session) -> None:
     """The outer one goes on."""
     array, result = np.ones(100, np.float32), np.empty(100, np.float32)
 
     def fail() -> None:
         with fresh.job() as inner:
             arguments = [np.float32(2), inner.read(array), inner.write(result)]
-            inner.launch("scale.cl", "scale", runtime.defines_for(array.dtype), array.shape, arguments)
-            inner.launch("scale.cl", "no_such_kernel", runtime.defines_for(array.dtype), (1,), [])
+            inner.launch("scale.cl", "scale", opencl.defines_for(array.dtype), array.shape, arguments)
+            inner.launch("scale.cl", "no_such_kernel", opencl.defines_for(array.dtype), (1,), [])
 
     with fresh.job() as outer:
         with pytest.raises(KeyError):
@@ -352,7 +355,7 @@ def test_the_leftovers_of_a_failed_job_inside_another(kernels: Path, fresh: runt
         assert [other[0] for other in others] == [3, 4] and result[0] == 2
 
 
-def test_a_session_counts_the_seconds_of_its_jobs(kernels: Path, fresh: runtime.Session) -> None:
+def test_a_session_counts_the_seconds_of_its_jobs(kernels: Path, fresh: opencl.Session) -> None:
     """From a job's first argument to its last result, once where one job is inside another."""
     assert fresh.seconds == 0
     start = time.perf_counter()

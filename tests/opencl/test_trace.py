@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl.opencl import session as runtime
+from vestcl import opencl
 from vestcl.opencl import trace
 from vestcl.ops.unproject import unproject
 
@@ -39,11 +39,11 @@ def lies_in(inner: Event, outer: Event) -> bool:
 
 
 @pytest.fixture
-def traced(session: runtime.Session, tmp_path: Path) -> list[Event]:
+def traced(session: opencl.Session, tmp_path: Path) -> list[Event]:
     """Two stages with kernels, one in the other, and one beside them in another thread."""
 
     def elsewhere() -> None:
-        with runtime.use(session.info.index), trace.stage("other thread"):
+        with opencl.use(session.info.index), trace.stage("other thread"):
             run_kernel()
 
     path = tmp_path / "new folder" / "trace.json"
@@ -74,7 +74,7 @@ def test_the_format(traced: list[Event]) -> None:
     assert len({tid for _, tid in named}) == len(named), "Perfetto takes a thread's number for unique"
 
 
-def test_tracks_are_named(traced: list[Event], session: runtime.Session) -> None:
+def test_tracks_are_named(traced: list[Event], session: opencl.Session) -> None:
     names = {kind: {e["args"]["name"] for e in traced if e["name"] == kind} for kind in ("process_name", "thread_name")}
     assert names["process_name"] == {"vestcl", f"OpenCL {session.info.index} {session.info.name}"}
     assert names["thread_name"] == {threading.current_thread().name, "helper", "kernels"}
@@ -114,7 +114,7 @@ def test_an_arrow_leads_from_a_job_to_each_kernel(traced: list[Event]) -> None:
         assert [job for job in jobs if job["tid"] == start["tid"] and lies_in(start, job)]
 
 
-def test_nothing_is_recorded_outside(session: runtime.Session, tmp_path: Path) -> None:
+def test_nothing_is_recorded_outside(session: opencl.Session, tmp_path: Path) -> None:
     path = tmp_path / "trace.json"
     with trace.stage("before"):
         run_kernel()
@@ -128,7 +128,7 @@ def test_nothing_is_recorded_outside(session: runtime.Session, tmp_path: Path) -
     assert trace.stage("a") is trace.stage("b"), "while nothing records, a stage is nothing"
 
 
-def test_a_failure_leaves_the_trace_up_to_it(session: runtime.Session, tmp_path: Path) -> None:
+def test_a_failure_leaves_the_trace_up_to_it(session: opencl.Session, tmp_path: Path) -> None:
     path = tmp_path / "trace.json"
     with pytest.raises(ValueError, match="`K` must be invertible"), trace.record(path), trace.stage("fails"):
         unproject(np.ones((1, 1, 2, 2), np.float32), np.zeros((1, 3, 3), np.float32))
@@ -148,36 +148,36 @@ def test_one_trace_at_a_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ahead", [-(10**15), 0, 10**12], ids=["behind", "equal", "ahead"])
-def test_a_device_may_count_from_any_time(session: runtime.Session, ahead: int) -> None:
+def test_a_device_may_count_from_any_time(session: opencl.Session, ahead: int) -> None:
     """Kernels of a made-up clock come back to where they were; what one comparison got wrong, the job's bounds mend."""
     recording = trace._Recording()
     wrong = 1_000_000  # more than the job's bounds allow
     recording._clocks[session] = recording.began, ahead + wrong
     launches = [
-        runtime.Launch(name, recording.began + at, *(recording.began + ahead + at + later for later in (1, 2, 10, 40)))
+        opencl.Launch(name, recording.began + at, *(recording.began + ahead + at + later for later in (1, 2, 10, 40)))
         for name, at in (("first", 100), ("second", 200))
     ]
-    recording.job(runtime.JobTimes(session, recording.began + 50, recording.began + 300, tuple(launches)))
+    recording.job(opencl.JobTimes(session, recording.began + 50, recording.began + 300, tuple(launches)))
     for kernel, at in zip(recording.kernels, (100, 200), strict=True):
         assert kernel.enqueued == recording.began + at <= kernel.queued < kernel.submitted < kernel.start
         assert kernel.end <= recording.began + 300 and kernel.end - kernel.start == 30
 
 
-def test_a_driver_that_does_not_tell_when_kernels_are_queued(session: runtime.Session) -> None:
+def test_a_driver_that_does_not_tell_when_kernels_are_queued(session: opencl.Session) -> None:
     recording = trace._Recording()
     recording._clocks[session] = recording.began, 7
-    launch = runtime.Launch("kernel", recording.began + 10, 0, 0, recording.began + 27, recording.began + 37)
-    recording.job(runtime.JobTimes(session, recording.began, recording.began + 100, (launch,)))
+    launch = opencl.Launch("kernel", recording.began + 10, 0, 0, recording.began + 27, recording.began + 37)
+    recording.job(opencl.JobTimes(session, recording.began, recording.began + 100, (launch,)))
     assert recording.kernels[0].start == recording.began + 20
 
 
 def test_clocks_are_compared_again_when_they_may_have_drifted(
-    session: runtime.Session, monkeypatch: pytest.MonkeyPatch
+    session: opencl.Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compared: list[int] = []
     monkeypatch.setattr(session, "clock_bounds", lambda: (compared.append(1) or 0, 0))
     recording = trace._Recording()
     for end in (10, 20, 10 + trace._CLOCK_AGE, 11 + trace._CLOCK_AGE, 12 + trace._CLOCK_AGE):
-        launch = runtime.Launch("kernel", end - 5, end - 4, end - 4, end - 3, end - 2)
-        recording.job(runtime.JobTimes(session, end - 6, end, (launch,)))
+        launch = opencl.Launch("kernel", end - 5, end - 4, end - 4, end - 3, end - 2)
+        recording.job(opencl.JobTimes(session, end - 6, end, (launch,)))
     assert len(compared) == 2

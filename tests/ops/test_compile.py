@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from vestcl.opencl import session as runtime
+from vestcl import opencl
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.splat import composite, rasterize, skipped, splat
@@ -80,7 +80,7 @@ def assert_same(got: list[torch.Tensor], wanted: list[torch.Tensor]) -> None:
 
 
 @pytest.mark.parametrize("name", OPERATORS)
-def test_graph_break_and_the_eager_result(session: runtime.Session, name: str) -> None:
+def test_graph_break_and_the_eager_result(session: opencl.Session, name: str) -> None:
     torch._dynamo.reset()
     inputs = values()
     assert_same(results(torch.compile(OPERATORS[name], backend="eager"), inputs), results(OPERATORS[name], inputs))
@@ -88,7 +88,7 @@ def test_graph_break_and_the_eager_result(session: runtime.Session, name: str) -
         torch.compile(OPERATORS[name], backend="eager", fullgraph=True)(inputs)
 
 
-def test_all_operators_at_two_sizes(session: runtime.Session) -> None:
+def test_all_operators_at_two_sizes(session: opencl.Session) -> None:
     torch._dynamo.reset()
     compiled = torch.compile(all_outputs, backend="aot_eager")
     for height in (5, 7):
@@ -96,7 +96,7 @@ def test_all_operators_at_two_sizes(session: runtime.Session) -> None:
         assert_same(results(compiled, inputs), results(all_outputs, inputs))
 
 
-def test_a_compiled_training_step(session: runtime.Session) -> None:
+def test_a_compiled_training_step(session: opencl.Session) -> None:
     """Backward called inside: the compiler meets the operators' backward, too."""
     torch._dynamo.reset()
 
@@ -109,7 +109,7 @@ def test_a_compiled_training_step(session: runtime.Session) -> None:
     assert_same(results(torch.compile(step, backend="eager"), inputs), results(step, inputs))
 
 
-def test_a_new_shape_recompiles_no_operator(session: runtime.Session) -> None:
+def test_a_new_shape_recompiles_no_operator(session: opencl.Session) -> None:
     """Frames of vestcl are not compiled at all: they would be, for each shape, up to the compiler's limit."""
     torch._dynamo.reset()
     compiled = torch.compile(lambda v: unproject(v["depth"] * 2, CAMERA) * 2, backend="eager", dynamic=True)
@@ -120,7 +120,7 @@ def test_a_new_shape_recompiles_no_operator(session: runtime.Session) -> None:
     assert frames[1:] == frames[1:2] * 5
 
 
-def test_numpy_arrays(session: runtime.Session) -> None:
+def test_numpy_arrays(session: opencl.Session) -> None:
     torch._dynamo.reset()
     arrays = values()["depth"].numpy(), CAMERA.numpy()
     compiled = torch.compile(lambda depth, K: unproject(depth * 2, K) + 1, backend="eager")

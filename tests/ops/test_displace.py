@@ -9,8 +9,7 @@ import torch
 from tolerances import assert_close, assert_like_twin
 from torch.autograd import gradcheck
 
-from vestcl import geometry, reference
-from vestcl.opencl import session as runtime
+from vestcl import geometry, opencl, reference
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
@@ -29,7 +28,7 @@ def scene(batch: int, count: int, dtype: torch.dtype) -> dict[str, torch.Tensor]
     }
 
 
-def test_by_hand(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
+def test_by_hand(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
     points_xyz = torch.tensor([[[1.0, 2, 3], [0, 0, 1]]], dtype=dtype)
     displacement_xyz = torch.tensor([[[1.0, -1, 1], [0, 0, 0]]], dtype=dtype)
     K = torch.tensor([[[8.0, 0, 10], [0, 16, 20], [0, 0, 1]]], dtype=dtype)
@@ -46,7 +45,7 @@ def test_by_hand(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("moved_camera", [True, False])
 @pytest.mark.parametrize(("batch", "count"), [(1, 1), (3, 100), (2, 5000)])
 def test_like_twin(
-    mapped_session: runtime.Session, dtype: torch.dtype, batch: int, count: int, moved_camera: bool
+    mapped_session: opencl.Session, dtype: torch.dtype, batch: int, count: int, moved_camera: bool
 ) -> None:
     arguments = scene(batch, count, dtype)
     if not moved_camera:
@@ -54,26 +53,26 @@ def test_like_twin(
     assert_like_twin(displace, reference.displace, **arguments)
 
 
-def test_any_last_row_of_the_intrinsics(session: runtime.Session, dtype: torch.dtype) -> None:
+def test_any_last_row_of_the_intrinsics(session: opencl.Session, dtype: torch.dtype) -> None:
     arguments = scene(2, 100, dtype)
     arguments["K"][:, 2] = torch.tensor([0.01, -0.02, 1.5], dtype=dtype)
     assert_like_twin(displace, reference.displace, **arguments)
 
 
-def test_gradcheck(mapped_session: runtime.Session, float64: torch.dtype) -> None:
+def test_gradcheck(mapped_session: opencl.Session, float64: torch.dtype) -> None:
     arguments = scene(2, 5, float64)
     assert gradcheck(displace, tuple(arguments.values()))
     assert gradcheck(displace, tuple(arguments.values())[:3])
 
 
 @pytest.mark.parametrize("asked", ["points_xyz", "displacement_xyz"])
-def test_only_the_gradient_asked_for(session: runtime.Session, asked: str) -> None:
+def test_only_the_gradient_asked_for(session: opencl.Session, asked: str) -> None:
     arguments = {name: value.detach() for name, value in scene(2, 50, torch.float32).items()}
     arguments[asked].requires_grad_()
     assert_like_twin(displace, reference.displace, **arguments)
 
 
-def test_the_two_gradients_are_equal_and_not_the_same_memory(session: runtime.Session) -> None:
+def test_the_two_gradients_are_equal_and_not_the_same_memory(session: opencl.Session) -> None:
     arguments = scene(2, 50, torch.float32)
     points_uv, z = displace(**arguments)
     (points_uv.sum() + z.sum()).backward()
@@ -83,12 +82,12 @@ def test_the_two_gradients_are_equal_and_not_the_same_memory(session: runtime.Se
 
 
 @pytest.mark.parametrize("output", [0, 1])
-def test_gradient_of_one_output_alone(session: runtime.Session, output: int) -> None:
+def test_gradient_of_one_output_alone(session: opencl.Session, output: int) -> None:
     arguments = scene(2, 50, torch.float32)
     assert_like_twin(lambda **a: displace(**a)[output], lambda **a: reference.displace(**a)[output], **arguments)
 
 
-def test_unprojected_pixels_come_back_to_their_centres(session: runtime.Session, dtype: torch.dtype) -> None:
+def test_unprojected_pixels_come_back_to_their_centres(session: opencl.Session, dtype: torch.dtype) -> None:
     K = scene(2, 0, dtype)["K"]
     depth = torch.rand(2, 1, 5, 7, dtype=dtype) * 50 + 1
     points_xyz = unproject(depth, K)
@@ -98,7 +97,7 @@ def test_unprojected_pixels_come_back_to_their_centres(session: runtime.Session,
     assert_close(z, depth.reshape(2, 35))
 
 
-def test_moving_the_camera_is_moving_the_points(session: runtime.Session, float64: torch.dtype) -> None:
+def test_moving_the_camera_is_moving_the_points(session: opencl.Session, float64: torch.dtype) -> None:
     arguments = scene(2, 50, float64)
     quaternion = torch.tensor([[1.0, 0.01, -0.02, 0.03]], dtype=float64).repeat(2, 1)
     translation = torch.tensor([[-0.5, 0.1, 0.8]], dtype=float64).repeat(2, 1)
@@ -111,7 +110,7 @@ def test_moving_the_camera_is_moving_the_points(session: runtime.Session, float6
         assert_close(moved_camera, moved_points)
 
 
-def test_behind_the_camera_is_projected_through_it(session: runtime.Session, dtype: torch.dtype) -> None:
+def test_behind_the_camera_is_projected_through_it(session: opencl.Session, dtype: torch.dtype) -> None:
     arguments = scene(1, 50, dtype)
     with torch.no_grad():
         arguments["points_xyz"] *= -1
@@ -119,7 +118,7 @@ def test_behind_the_camera_is_projected_through_it(session: runtime.Session, dty
     assert_like_twin(displace, reference.displace, **arguments)
 
 
-def test_points_that_have_no_image_touch_nothing_else(mapped_session: runtime.Session) -> None:
+def test_points_that_have_no_image_touch_nothing_else(mapped_session: opencl.Session) -> None:
     """z = 0 on the axis (0 / 0) and off it (x / 0), and NaN: no gradient through uv, an exact one through z."""
     arguments = scene(1, 50, torch.float32)
     del arguments["tgt_from_src"]
@@ -138,14 +137,14 @@ def test_points_that_have_no_image_touch_nothing_else(mapped_session: runtime.Se
     assert grad[0, :4].tolist() == [[0, 0, 3]] * 4
 
 
-def test_numpy_in_numpy_out(session: runtime.Session, dtype: torch.dtype) -> None:
+def test_numpy_in_numpy_out(session: opencl.Session, dtype: torch.dtype) -> None:
     arguments = {name: value.detach() for name, value in scene(2, 50, dtype).items()}
     outputs = displace(**{name: value.numpy() for name, value in arguments.items()})
     for array, tensor in zip(outputs, displace(**arguments), strict=True):
         assert isinstance(array, np.ndarray) and np.array_equal(array, tensor.numpy())
 
 
-def test_one_array_as_both_arguments(session: runtime.Session) -> None:
+def test_one_array_as_both_arguments(session: opencl.Session) -> None:
     arguments = scene(1, 50, torch.float32)
     arguments["displacement_xyz"] = arguments["points_xyz"]
     twice = arguments | {"displacement_xyz": arguments["points_xyz"].detach().clone()}
@@ -153,7 +152,7 @@ def test_one_array_as_both_arguments(session: runtime.Session) -> None:
 
 
 @pytest.mark.parametrize(("batch", "count"), [(0, 5), (2, 0)])
-def test_nothing_to_do(session: runtime.Session, batch: int, count: int) -> None:
+def test_nothing_to_do(session: opencl.Session, batch: int, count: int) -> None:
     arguments = scene(batch, count, torch.float32)
     points_uv, z = displace(**arguments)
     assert points_uv.shape == (batch, count, 2) and z.shape == (batch, count)
@@ -161,7 +160,7 @@ def test_nothing_to_do(session: runtime.Session, batch: int, count: int) -> None
     assert arguments["points_xyz"].grad is not None and arguments["points_xyz"].grad.shape == (batch, count, 3)
 
 
-def test_same_bits_twice(mapped_session: runtime.Session) -> None:
+def test_same_bits_twice(mapped_session: opencl.Session) -> None:
     arguments = scene(2, 3000, torch.float32)
     (first_uv, first_z), (second_uv, second_z) = displace(**arguments), displace(**arguments)
     assert torch.equal(first_uv, second_uv) and torch.equal(first_z, second_z)
@@ -190,7 +189,7 @@ def test_refuses(change: dict[str, Any], message: str) -> None:
         displace(**(scene(2, 3, torch.float32) | change))
 
 
-def test_a_camera_that_requires_grad_is_welcome_where_none_is_recorded(session: runtime.Session) -> None:
+def test_a_camera_that_requires_grad_is_welcome_where_none_is_recorded(session: opencl.Session) -> None:
     arguments = scene(2, 3, torch.float32)
     with torch.no_grad():
         assert displace(**(arguments | {"K": arguments["K"].requires_grad_()}))[0].isfinite().all()

@@ -14,8 +14,7 @@ import torch
 from tolerances import assert_close, assert_like_twin
 from torch.autograd import gradcheck
 
-from vestcl import geometry, reference
-from vestcl.opencl import session as runtime
+from vestcl import geometry, opencl, reference
 from vestcl.ops.rigid_flow import rigid_flow
 
 
@@ -31,7 +30,7 @@ def scene(batch: int, count: int, dtype: torch.dtype) -> dict[str, torch.Tensor]
     return {name: value.to(dtype).requires_grad_() for name, value in values.items()}
 
 
-def test_by_hand(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
+def test_by_hand(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
     points_xyz = torch.tensor([[[1.0, 2, 3], [0, 0, 0]]], dtype=dtype)
     half_turn_about_y = torch.tensor([[0.0, 0, 2, 0]], dtype=dtype)
     translation = torch.tensor([[10.0, 20, 30]], dtype=dtype)
@@ -39,11 +38,11 @@ def test_by_hand(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize(("batch", "count"), [(1, 1), (3, 100), (2, 5000)])
-def test_like_twin(mapped_session: runtime.Session, dtype: torch.dtype, batch: int, count: int) -> None:
+def test_like_twin(mapped_session: opencl.Session, dtype: torch.dtype, batch: int, count: int) -> None:
     assert_like_twin(rigid_flow, reference.rigid_flow, **scene(batch, count, dtype))
 
 
-def test_sums_keep_float32_over_many_points(mapped_session: runtime.Session) -> None:
+def test_sums_keep_float32_over_many_points(mapped_session: opencl.Session) -> None:
     """Equal terms are the worst case of a plain float32 sum: it is off by 1e-3 here."""
     arguments = scene(1, 1, torch.float32)
     arguments["points_xyz"] = torch.full((1, 1_000_001, 3), 1 / 3, requires_grad=True)
@@ -56,12 +55,12 @@ def test_sums_keep_float32_over_many_points(mapped_session: runtime.Session) -> 
         assert_close(got, wanted, name)
 
 
-def test_gradcheck(mapped_session: runtime.Session, float64: torch.dtype) -> None:
+def test_gradcheck(mapped_session: opencl.Session, float64: torch.dtype) -> None:
     assert gradcheck(rigid_flow, tuple(scene(2, 5, float64).values()))
 
 
 @pytest.mark.parametrize("length", [1e-5, 1e-7, 1e-9, 1e-20])
-def test_gradcheck_of_short_quaternions(session: runtime.Session, float64: torch.dtype, length: float) -> None:
+def test_gradcheck_of_short_quaternions(session: opencl.Session, float64: torch.dtype, length: float) -> None:
     """Above the floor of 1e-8 only the direction counts, below it q is divided by the floor alone."""
     arguments = scene(2, 5, float64)
     shape = torch.nn.functional.normalize(arguments["quaternion"].detach()).requires_grad_()
@@ -69,7 +68,7 @@ def test_gradcheck_of_short_quaternions(session: runtime.Session, float64: torch
     assert gradcheck(lambda shape: rigid_flow(points_xyz, length * shape, translation), (shape,))
 
 
-def test_zero_quaternion(session: runtime.Session, dtype: torch.dtype) -> None:
+def test_zero_quaternion(session: opencl.Session, dtype: torch.dtype) -> None:
     arguments = scene(2, 5, dtype)
     arguments["quaternion"] = torch.zeros(2, 4, dtype=dtype, requires_grad=True)
     displacement_xyz = rigid_flow(**arguments)
@@ -79,7 +78,7 @@ def test_zero_quaternion(session: runtime.Session, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("asked", ["points_xyz", "quaternion", "translation"])
-def test_only_the_gradients_asked_for(session: runtime.Session, asked: str) -> None:
+def test_only_the_gradients_asked_for(session: opencl.Session, asked: str) -> None:
     arguments = {name: value.detach() for name, value in scene(2, 50, torch.float32).items()}
     arguments[asked].requires_grad_()
     assert_like_twin(rigid_flow, reference.rigid_flow, **arguments)
@@ -89,13 +88,13 @@ def test_only_the_gradients_asked_for(session: runtime.Session, asked: str) -> N
     assert ("rigid_flow_backward_points" in [time.name for time in times]) == (asked == "points_xyz")
 
 
-def test_identity_moves_nothing(session: runtime.Session, dtype: torch.dtype) -> None:
+def test_identity_moves_nothing(session: opencl.Session, dtype: torch.dtype) -> None:
     points_xyz = scene(2, 50, dtype)["points_xyz"]
     identity = torch.tensor([[3.0, 0, 0, 0]], dtype=dtype).repeat(2, 1)
     assert not rigid_flow(points_xyz, identity, torch.zeros(2, 3, dtype=dtype)).any()
 
 
-def test_there_and_back(session: runtime.Session, float64: torch.dtype) -> None:
+def test_there_and_back(session: opencl.Session, float64: torch.dtype) -> None:
     points_xyz, quaternion, translation = scene(2, 50, float64).values()
     moved_xyz = points_xyz + rigid_flow(points_xyz, quaternion, translation)
     conjugate = quaternion * torch.tensor([1.0, -1, -1, -1])
@@ -103,7 +102,7 @@ def test_there_and_back(session: runtime.Session, float64: torch.dtype) -> None:
     assert_close(moved_xyz + rigid_flow(moved_xyz, conjugate, src_from_dst[:, :3, 3]), points_xyz)
 
 
-def test_two_motions_are_one(session: runtime.Session, float64: torch.dtype) -> None:
+def test_two_motions_are_one(session: opencl.Session, float64: torch.dtype) -> None:
     points_xyz, first, translation = scene(2, 50, float64).values()
     half = torch.tensor([[math.sqrt(0.5), 0, math.sqrt(0.5), 0]], dtype=float64).repeat(2, 1)
     zero = torch.zeros_like(translation)
@@ -113,7 +112,7 @@ def test_two_motions_are_one(session: runtime.Session, float64: torch.dtype) -> 
     assert_close(one_by_one, at_once)
 
 
-def test_numpy_in_numpy_out(session: runtime.Session, dtype: torch.dtype) -> None:
+def test_numpy_in_numpy_out(session: opencl.Session, dtype: torch.dtype) -> None:
     arguments = {name: value.detach() for name, value in scene(2, 50, dtype).items()}
     displacement_xyz = rigid_flow(**{name: value.numpy() for name, value in arguments.items()})
     assert isinstance(displacement_xyz, np.ndarray)
@@ -121,7 +120,7 @@ def test_numpy_in_numpy_out(session: runtime.Session, dtype: torch.dtype) -> Non
 
 
 @pytest.mark.parametrize(("batch", "count"), [(0, 5), (2, 0)])
-def test_nothing_to_do(session: runtime.Session, batch: int, count: int) -> None:
+def test_nothing_to_do(session: opencl.Session, batch: int, count: int) -> None:
     arguments = scene(batch, count, torch.float32)
     displacement_xyz = rigid_flow(**arguments)
     assert displacement_xyz.shape == (batch, count, 3)
@@ -131,7 +130,7 @@ def test_nothing_to_do(session: runtime.Session, batch: int, count: int) -> None
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_points_that_are_not_finite_touch_nothing_else(mapped_session: runtime.Session, bad: float) -> None:
+def test_points_that_are_not_finite_touch_nothing_else(mapped_session: opencl.Session, bad: float) -> None:
     arguments = scene(2, 50, torch.float32)
     with torch.no_grad():
         arguments["points_xyz"][1, 7, 2] = bad
@@ -156,7 +155,7 @@ def bits() -> str:
     return hashlib.sha256(b"".join(t.detach().numpy().tobytes() for t in (displacement_xyz, *grads))).hexdigest()
 
 
-def test_same_bits_twice(mapped_session: runtime.Session) -> None:
+def test_same_bits_twice(mapped_session: opencl.Session) -> None:
     assert bits() == bits()
 
 

@@ -10,8 +10,7 @@ import pytest
 import torch
 from torch.autograd import gradgradcheck
 
-from vestcl import reference
-from vestcl.opencl import session as runtime
+from vestcl import opencl, reference
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.splat import composite, rasterize, splat
@@ -74,14 +73,14 @@ def scene(asked: Sequence[str], dtype: torch.dtype = torch.float64) -> dict[str,
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize(("name", "asked"), [(name, asked) for name in SMOOTH for asked in chosen(list(SHAPES[name]))])
 def test_gradgradcheck(
-    session: runtime.Session, float64: torch.dtype, name: str, asked: tuple[str, ...], loss: str
+    session: opencl.Session, float64: torch.dtype, name: str, asked: tuple[str, ...], loss: str
 ) -> None:
     inputs = tuple(values(name, asked).values())
     assert gradgradcheck(lambda *given: outputs(SMOOTH[name], LOSSES[loss], *given), inputs)
 
 
 @pytest.mark.parametrize("name", SMOOTH)
-def test_third_derivatives_are_the_references(session: runtime.Session, float64: torch.dtype, name: str) -> None:
+def test_third_derivatives_are_the_references(session: opencl.Session, float64: torch.dtype, name: str) -> None:
     inputs = values(name, list(SHAPES[name]))
 
     def third(function: Callable[..., Any]) -> list[torch.Tensor]:
@@ -97,7 +96,7 @@ def test_third_derivatives_are_the_references(session: runtime.Session, float64:
 
 @pytest.mark.parametrize("name", SMOOTH)
 def test_a_graph_of_the_gradients_does_not_change_them(
-    mapped_session: runtime.Session, dtype: torch.dtype, name: str
+    mapped_session: opencl.Session, dtype: torch.dtype, name: str
 ) -> None:
     """They are the kernels' with ``create_graph=True``, too, and each can be changed in place."""
     inputs = [value.detach().to(dtype).requires_grad_() for value in values(name, list(SHAPES[name])).values()]
@@ -111,12 +110,12 @@ def test_a_graph_of_the_gradients_does_not_change_them(
         assert torch.equal(2 * one, other)
 
 
-def test_one_tensor_twice(session: runtime.Session, float64: torch.dtype) -> None:
+def test_one_tensor_twice(session: opencl.Session, float64: torch.dtype) -> None:
     both = torch.rand(1, 3, 3, dtype=float64, requires_grad=True)
     assert gradgradcheck(lambda x: displace(x, x, K), (both,))
 
 
-def test_second_derivative_where_uv_is_not_finite(session: runtime.Session, float64: torch.dtype) -> None:
+def test_second_derivative_where_uv_is_not_finite(session: opencl.Session, float64: torch.dtype) -> None:
     points = torch.tensor([[[1.0, 2, 0], [1, 2, 3], [torch.nan, 1, 2], [torch.inf, 1, 2]]], dtype=float64)
     points = points.requires_grad_()
     points_uv, _ = displace(points, torch.zeros_like(points), torch.eye(3, dtype=float64)[None])
@@ -125,7 +124,7 @@ def test_second_derivative_where_uv_is_not_finite(session: runtime.Session, floa
     assert second[0, 1].all() and not second[0, [0, 2, 3]].any()
 
 
-def test_second_derivative_at_a_quaternion_of_zeros(session: runtime.Session, float64: torch.dtype) -> None:
+def test_second_derivative_at_a_quaternion_of_zeros(session: opencl.Session, float64: torch.dtype) -> None:
     """R - I = (2e16) (w [v]x + [v]x [v]x) there, so that d2u / dx^2 of p = (0, 1, 0) is (0, -4e16, 0)."""
     quaternion = torch.zeros(1, 4, dtype=float64, requires_grad=True)
     point = torch.tensor([[[0.0, 1, 0]]], dtype=float64)
@@ -137,7 +136,7 @@ def test_second_derivative_at_a_quaternion_of_zeros(session: runtime.Session, fl
 
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("asked", [(name,) for name in SPLAT] + [SPLAT])
-def test_splat_refuses_second_derivatives(mapped_session: runtime.Session, asked: tuple[str, ...], loss: str) -> None:
+def test_splat_refuses_second_derivatives(mapped_session: opencl.Session, asked: tuple[str, ...], loss: str) -> None:
     """By whatever way they would be reached: also where another path to the input would hide that one is missing."""
     arguments = scene(asked, torch.float32)
     inputs = [arguments[name] for name in asked]
@@ -156,7 +155,7 @@ def test_splat_refuses_second_derivatives(mapped_session: runtime.Session, asked
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("name", SPLAT)
 def test_splat_fails_gradgradcheck_by_that_error(
-    session: runtime.Session, float64: torch.dtype, name: str, loss: str
+    session: opencl.Session, float64: torch.dtype, name: str, loss: str
 ) -> None:
     arguments = scene([name])
     with pytest.raises(NotImplementedError, match=NO_SECOND):
@@ -165,7 +164,7 @@ def test_splat_fails_gradgradcheck_by_that_error(
         )
 
 
-def test_derivatives_of_one_gradient_to_other_inputs_are_refused(session: runtime.Session) -> None:
+def test_derivatives_of_one_gradient_to_other_inputs_are_refused(session: opencl.Session) -> None:
     """Gradients of the features alone, and then those of the points they depend on; and through the loss's weights."""
     arguments = scene(["points_uv", "features"], torch.float32)
     weights = torch.rand(1, 2, 5, 4, requires_grad=True)
@@ -176,7 +175,7 @@ def test_derivatives_of_one_gradient_to_other_inputs_are_refused(session: runtim
             torch.autograd.grad(grad.sum(), target, retain_graph=True)
 
 
-def test_points_changed_in_place_lead_to_the_refusal(session: runtime.Session) -> None:
+def test_points_changed_in_place_lead_to_the_refusal(session: opencl.Session) -> None:
     """The gradient belongs to the graph that there was when the geometry was composited."""
     arguments = scene(["points_uv"], torch.float32)
     points_uv = arguments["points_uv"] * 1
@@ -187,7 +186,7 @@ def test_points_changed_in_place_lead_to_the_refusal(session: runtime.Session) -
         torch.autograd.grad(grad.sum() + arguments["points_uv"].sum(), arguments["points_uv"])
 
 
-def test_a_graph_of_splats_gradients_is_freed_with_them(session: runtime.Session) -> None:
+def test_a_graph_of_splats_gradients_is_freed_with_them(session: opencl.Session) -> None:
     arguments = scene(["features"], torch.float32)
     geometry = ("points_uv", "z", "radii", "opacities", "height", "width")
     raster = rasterize(**{name: arguments[name] for name in geometry})

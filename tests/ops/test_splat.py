@@ -8,8 +8,7 @@ import torch
 from tolerances import assert_close, assert_like_twin
 from torch.autograd import gradcheck
 
-from vestcl import reference
-from vestcl.opencl import session as runtime
+from vestcl import opencl, reference
 from vestcl.ops.splat import composite, rasterize, splat
 
 Scene = dict[str, Any]
@@ -67,7 +66,7 @@ def assert_same_bits(got: tuple[torch.Tensor, ...], wanted: tuple[torch.Tensor, 
         assert torch.equal(one, other)
 
 
-def test_oracle(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
+def test_oracle(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
     """o = 1, r = 1.5: 1 at the own pixel, 5/9 at the 4-neighbours, 1/9 at the diagonals, nothing further out."""
     point = pile([1.0], [2.0], r=1.5, dtype=dtype) | {"height": 5, "width": 5}
     image, coverage = splat(**(point | {"points_uv": torch.full((1, 1, 2), 2.5, dtype=dtype)}))
@@ -78,7 +77,7 @@ def test_oracle(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
     assert_close(image, 2 * wanted)
 
 
-def test_two_layers_by_hand(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
+def test_two_layers_by_hand(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
     """The far one comes first in memory. Own pixel: a = 0.5 in front of 0.75; right neighbour: 5/18 of 5/12."""
     points = pile([0.75, 0.5], [10.0, 20.0], r=1.5, dtype=dtype) | {"width": 2}
     points |= {"z": torch.tensor([[4, 2]], dtype=dtype), "backgrounds": torch.tensor([[100]], dtype=dtype)}
@@ -89,7 +88,7 @@ def test_two_layers_by_hand(mapped_session: runtime.Session, dtype: torch.dtype)
     assert coverage[0, 0, 0, 1].item() == pytest.approx(1 - (1 - near) * (1 - far))
 
 
-def test_gradients_by_hand_behind_an_opaque_point(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
+def test_gradients_by_hand_behind_an_opaque_point(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
     """dL/da_1 = f_1 - f_2 and dL/da_2 = 0, for two opaque points on one pixel: 1 - a = 0 divides nothing."""
     points = pile([1.0, 1.0], [3.0, 5.0], dtype=dtype)
     opacities, features = points["opacities"].requires_grad_(), points["features"].requires_grad_()
@@ -98,12 +97,12 @@ def test_gradients_by_hand_behind_an_opaque_point(mapped_session: runtime.Sessio
     assert features.grad is not None and features.grad.tolist() == [[[1], [0]]]
 
 
-def test_equal_depths_are_composited_by_index(mapped_session: runtime.Session) -> None:
+def test_equal_depths_are_composited_by_index(mapped_session: opencl.Session) -> None:
     points = pile([1.0] * 3, [1.0, 2.0, 3.0])
     assert splat(**(points | {"z": torch.ones(1, 3)}))[0].item() == 1
 
 
-def test_min_transmittance_by_hand(mapped_session: runtime.Session) -> None:
+def test_min_transmittance_by_hand(mapped_session: opencl.Session) -> None:
     """T is 1, 0.5, 0.25, ...: with 0.5 two points are taken, for 0.5 is not below 0.5; with 0.6 one."""
     points = pile([0.5] * 4, [1.0, 10.0, 100.0, 1000.0])
     for limit, wanted, covered in [(0.0, 78.0, 0.9375), (0.5, 3.0, 0.75), (0.6, 0.5, 0.5)]:
@@ -116,7 +115,7 @@ def test_min_transmittance_by_hand(mapped_session: runtime.Session) -> None:
     [(n, torch.float32) for n in (1, 2, 3, 4, 5, 16, 32, 37, 64, 256)] + [(n, torch.float64) for n in (1, 5, 16, 37)],
     indirect=["dtype"],
 )
-def test_like_twin(mapped_session: runtime.Session, dtype: torch.dtype, channels: int) -> None:
+def test_like_twin(mapped_session: opencl.Session, dtype: torch.dtype, channels: int) -> None:
     arguments = scene(2, 120, channels, dtype)
     assert_like_twin(splat, reference.splat, **arguments)
     image, coverage = splat(**arguments)
@@ -125,12 +124,12 @@ def test_like_twin(mapped_session: runtime.Session, dtype: torch.dtype, channels
 
 
 @pytest.mark.parametrize("min_transmittance", [0.02, 0.3])
-def test_truncated_like_twin(mapped_session: runtime.Session, dtype: torch.dtype, min_transmittance: float) -> None:
+def test_truncated_like_twin(mapped_session: opencl.Session, dtype: torch.dtype, min_transmittance: float) -> None:
     assert_like_twin(splat, reference.splat, **scene(2, 400, 3, dtype), min_transmittance=min_transmittance)
 
 
 @pytest.mark.parametrize("output", [0, 1])
-def test_gradient_of_one_output_alone(mapped_session: runtime.Session, output: int) -> None:
+def test_gradient_of_one_output_alone(mapped_session: opencl.Session, output: int) -> None:
     arguments = scene(2, 50, 3)
     if output == 1:  # the twin's coverage does not depend on these, the operator's gradient of them is 0
         grads = torch.autograd.grad(splat(**arguments)[1].sum(), [arguments[name] for name in INPUTS])
@@ -141,15 +140,15 @@ def test_gradient_of_one_output_alone(mapped_session: runtime.Session, output: i
 
 @pytest.mark.parametrize("asked", INPUTS)
 def test_only_the_gradient_asked_for(
-    mapped_session: runtime.Session, monkeypatch: pytest.MonkeyPatch, asked: str
+    mapped_session: opencl.Session, monkeypatch: pytest.MonkeyPatch, asked: str
 ) -> None:
     """It is right, and the kernels that compute it are built for it alone."""
     arguments = detached(scene(2, 50, 3))
     arguments[asked].requires_grad_()
-    built: list[runtime.Defines] = []
+    built: list[opencl.Defines] = []
     plain = mapped_session.kernel
 
-    def kernel(file: str, name: str, defines: runtime.Defines) -> Any:
+    def kernel(file: str, name: str, defines: opencl.Defines) -> Any:
         built.append(defines)
         return plain(file, name, defines)
 
@@ -159,7 +158,7 @@ def test_only_the_gradient_asked_for(
     assert backward and all({n for n in INPUTS if d[f"GRAD_{n.upper()}"]} == {asked} for d in backward)
 
 
-def test_gradcheck(mapped_session: runtime.Session, float64: torch.dtype) -> None:
+def test_gradcheck(mapped_session: opencl.Session, float64: torch.dtype) -> None:
     arguments = scene(2, 12, 2, float64) | {"height": 3, "width": 18}
     with torch.no_grad():
         arguments["points_uv"] *= 0.45
@@ -168,7 +167,7 @@ def test_gradcheck(mapped_session: runtime.Session, float64: torch.dtype) -> Non
     check_gradients(arguments | {"min_transmittance": 0.3})  # no T is so close to it that gradcheck's steps cross it
 
 
-def test_gradcheck_on_a_pile_of_opaque_points(mapped_session: runtime.Session, float64: torch.dtype) -> None:
+def test_gradcheck_on_a_pile_of_opaque_points(mapped_session: opencl.Session, float64: torch.dtype) -> None:
     """Every point on the pixel's centre with alpha exactly 1 and the same depth."""
     points = pile([1.0] * 5, [1.0, -2.0, 3.0, -4.0, 5.0], dtype=float64)
     opacities, features = points.pop("opacities").requires_grad_(), points.pop("features").requires_grad_()
@@ -183,7 +182,7 @@ def check_gradients(arguments: Scene) -> None:
     assert gradcheck(outputs, tuple(arguments[name] for name in INPUTS))
 
 
-def test_numpy_in_numpy_out(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
+def test_numpy_in_numpy_out(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
     arguments = detached(scene(2, 50, 5, dtype))
     arrays: Scene = {name: v.numpy() if isinstance(v, torch.Tensor) else v for name, v in arguments.items()}
     for array, tensor in zip(splat(**arrays), splat(**arguments), strict=True):
@@ -191,7 +190,7 @@ def test_numpy_in_numpy_out(mapped_session: runtime.Session, dtype: torch.dtype)
 
 
 @pytest.mark.parametrize("nothing", ["no clouds", "no points", "all behind the camera", "all beside the image"])
-def test_nothing_to_draw(mapped_session: runtime.Session, nothing: str) -> None:
+def test_nothing_to_draw(mapped_session: opencl.Session, nothing: str) -> None:
     arguments = detached(scene(2, 5, 3))
     if nothing == "no clouds":
         arguments = {name: v[:0] if isinstance(v, torch.Tensor) else v for name, v in arguments.items()}
@@ -212,7 +211,7 @@ def test_nothing_to_draw(mapped_session: runtime.Session, nothing: str) -> None:
 
 
 @pytest.mark.parametrize("counts", [[30, 0, 12], [0, 0, 1], [42], [0]])
-def test_packed_clouds_are_the_clouds_alone(mapped_session: runtime.Session, counts: list[int]) -> None:
+def test_packed_clouds_are_the_clouds_alone(mapped_session: opencl.Session, counts: list[int]) -> None:
     clouds = [scene(1, count, 5) for count in counts]
     alone = [all_of(cloud) for cloud in clouds]
     packed = {name: torch.cat([cloud[name][0] for cloud in clouds]).detach() for name in ("z", *INPUTS[:4])}
@@ -227,7 +226,7 @@ def test_packed_clouds_are_the_clouds_alone(mapped_session: runtime.Session, cou
         assert torch.equal(image[b], image_alone[0]) and torch.equal(coverage[b], coverage_alone[0])
 
 
-def test_two_feature_sets_on_one_geometry(mapped_session: runtime.Session) -> None:
+def test_two_feature_sets_on_one_geometry(mapped_session: opencl.Session) -> None:
     """`composite` on one `rasterize` is `splat`, and the gradients of the two sets add up."""
     first = scene(2, 60, 3)
     second = first | {"features": torch.randn(2, 60, 16, requires_grad=True), "backgrounds": None}
@@ -296,6 +295,6 @@ def test_refuses_starts(starts: Any, message: str) -> None:
         splat(**packed, height=20, width=37, cloud_starts=starts)
 
 
-def test_a_depth_that_requires_grad_is_welcome_where_none_is_recorded(session: runtime.Session) -> None:
+def test_a_depth_that_requires_grad_is_welcome_where_none_is_recorded(session: opencl.Session) -> None:
     with torch.no_grad():
         assert splat(**(scene(1, 5, 3) | {"z": torch.ones(1, 5, requires_grad=True)}))[0].isfinite().all()

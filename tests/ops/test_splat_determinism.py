@@ -13,8 +13,8 @@ import pytest
 import torch
 from test_splat import INPUTS, all_of, assert_same_bits, detached, scene
 
+from vestcl import opencl
 from vestcl.opencl import host_memory
-from vestcl.opencl import session as runtime
 from vestcl.ops import _splat_lists
 from vestcl.ops.splat import composite, rasterize, splat
 
@@ -30,17 +30,17 @@ def report() -> None:
     """What a child process prints: the compute units that it has, and the bits of both mappings."""
     hashes = []
     for mapping in ("tile", "pixel"):
-        with runtime.use(None, mapping):
+        with opencl.use(None, mapping):
             hashes += [bits(5), bits(16)]
-    print(runtime.current().info.compute_units, *hashes)
+    print(opencl.current().info.compute_units, *hashes)
 
 
 @pytest.mark.parametrize("channels", [5, 16])
-def test_twice(mapped_session: runtime.Session, channels: int) -> None:
+def test_twice(mapped_session: opencl.Session, channels: int) -> None:
     assert bits(channels) == bits(channels)
 
 
-def test_any_number_of_threads(session: runtime.Session) -> None:
+def test_any_number_of_threads(session: opencl.Session) -> None:
     if "PoCL" not in session.info.version or session.info.kind != "CPU":
         pytest.skip("only PoCL on a CPU can be told how many threads to use")
     here = Path(__file__).resolve().parent
@@ -61,14 +61,14 @@ def test_any_number_of_threads(session: runtime.Session) -> None:
     reports = [child.communicate()[0].split() for child in children]
     assert [len(words) for words in reports] == [5, 5]
     assert reports[0][0] != reports[1][0], "both children have as many compute units"
-    with runtime.use(session.info.index, "tile"):
+    with opencl.use(session.info.index, "tile"):
         assert [bits(5), bits(16)] == reports[0][1:3]
     assert reports[0][1:] == reports[1][1:]
 
 
 @pytest.mark.parametrize("most", [1 << 24, 100_000, 1])
 def test_counters_are_bounded_on_any_number_of_units(
-    mapped_session: runtime.Session, monkeypatch: pytest.MonkeyPatch, most: int
+    mapped_session: opencl.Session, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
     """Of a CPU with 100,000 units, too; and no result depends on how many chunks there are."""
     counters = 3 * 6
@@ -82,7 +82,7 @@ def test_counters_are_bounded_on_any_number_of_units(
 
 @pytest.mark.parametrize("pattern", [0x00, 0xFF, 0x3F])  # zeros, NaN or -1, and harmless looking numbers
 def test_whatever_memory_held_before(
-    mapped_session: runtime.Session, monkeypatch: pytest.MonkeyPatch, pattern: int
+    mapped_session: opencl.Session, monkeypatch: pytest.MonkeyPatch, pattern: int
 ) -> None:
     """Outputs and scratch memory are written before they are read: their former contents leave no trace."""
     if not mapped_session.shares_host_memory:
@@ -96,12 +96,12 @@ def test_whatever_memory_held_before(
         array.reshape(-1).view(np.uint8).fill(pattern)
         return array
 
-    def scratch(job: runtime.Job, count: int, dtype: Any) -> runtime.Buffer:
+    def scratch(job: opencl.Job, count: int, dtype: Any) -> opencl.Buffer:
         scratches.append(count)
         return job.write(empty((max(1, count) * np.dtype(dtype).itemsize,), np.uint8))
 
     usual, filled, scratches = (bits(5), bits(16)), [], []
-    monkeypatch.setattr(runtime.Job, "scratch", scratch)
+    monkeypatch.setattr(opencl.Job, "scratch", scratch)
     monkeypatch.setattr(host_memory, "empty", empty)
     assert (bits(5), bits(16)) == usual
     assert len(filled) > 10 and scratches
@@ -109,7 +109,7 @@ def test_whatever_memory_held_before(
 
 @pytest.mark.parametrize("name", ["z", *INPUTS])
 @pytest.mark.parametrize("layout", ["every second", "transposed", "expanded"])
-def test_any_strides(mapped_session: runtime.Session, name: str, layout: str) -> None:
+def test_any_strides(mapped_session: opencl.Session, name: str, layout: str) -> None:
     arguments = scene(2, 40, 3)
     plain = arguments[name].detach()
     if layout == "every second":
@@ -126,7 +126,7 @@ def test_any_strides(mapped_session: runtime.Session, name: str, layout: str) ->
 
 @pytest.mark.parametrize("layout", ["channels-last", "transposed", "expanded"])
 @pytest.mark.parametrize("channels", [1, 5, 16])
-def test_any_strides_of_the_incoming_gradients(mapped_session: runtime.Session, layout: str, channels: int) -> None:
+def test_any_strides_of_the_incoming_gradients(mapped_session: opencl.Session, layout: str, channels: int) -> None:
     arguments = scene(2, 50, channels)
     image, coverage = splat(**arguments)
     if layout == "expanded":  # what .sum() makes
@@ -142,7 +142,7 @@ def test_any_strides_of_the_incoming_gradients(mapped_session: runtime.Session, 
     assert_same_bits(as_they_are, torch.autograd.grad((image, coverage), inputs, planar))
 
 
-def test_any_order_in_memory_at_distinct_depths(mapped_session: runtime.Session) -> None:
+def test_any_order_in_memory_at_distinct_depths(mapped_session: opencl.Session) -> None:
     arguments = scene(1, 300, 3)
     arguments["z"] = torch.randperm(300)[None] / 10 + 0.1
     order = torch.randperm(300)
@@ -155,7 +155,7 @@ def test_any_order_in_memory_at_distinct_depths(mapped_session: runtime.Session)
     assert_same_bits(all_of(shuffled), wanted)
 
 
-def test_a_raster_keeps_its_own_numbers(mapped_session: runtime.Session) -> None:
+def test_a_raster_keeps_its_own_numbers(mapped_session: opencl.Session) -> None:
     arguments = detached(scene(1, 50, 3))
     before = splat(**arguments)
     features, backgrounds = arguments.pop("features"), arguments.pop("backgrounds")

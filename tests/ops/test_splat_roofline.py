@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from vestcl import opencl
 from vestcl.bench.splat import roofline as _roofline
 from vestcl.bench.splat.kernels import bytes_of, flops_of
 from vestcl.bench.splat.measure import Facts, facts_of
 from vestcl.bench.splat.roofline import RooflineBench
 from vestcl.bench.splat.roofs import Roofline, roofline
 from vestcl.bench.splat.scenes import Scene, street
-from vestcl.opencl import session as runtime
 
 SIZE = (32, 48)
 CHANNELS = 4
@@ -22,12 +22,12 @@ COPY_BYTES = 1 << 16
 
 
 @pytest.fixture
-def measured(mapped_session: runtime.Session) -> tuple[Scene, Roofline]:
+def measured(mapped_session: opencl.Session) -> tuple[Scene, Roofline]:
     scene = street(*SIZE, CHANNELS, 1.0)
     return scene, roofline(scene, calls=2, copy_bytes=COPY_BYTES)
 
 
-def test_each_kernel_once_with_a_share(measured: tuple[Scene, Roofline], mapped_session: runtime.Session) -> None:
+def test_each_kernel_once_with_a_share(measured: tuple[Scene, Roofline], mapped_session: opencl.Session) -> None:
     scene, result = measured
     names = [point.name for point in result.points]
     wanted = {"tile": ["sort_tiles", "composite_tiles"], "pixel": ["sort_tiles_together", "composite_pixels"]}
@@ -45,7 +45,7 @@ def test_each_kernel_once_with_a_share(measured: tuple[Scene, Roofline], mapped_
     assert result.facts == facts_of(scene)
 
 
-def test_bytes_and_flops_by_hand(session: runtime.Session) -> None:
+def test_bytes_and_flops_by_hand(session: opencl.Session) -> None:
     """One point of radius 1 in the middle of a pixel, one that is behind; 16 x 16 pixels, 3 channels."""
     uv = torch.tensor([[[4.5, 4.5], [4.5, 4.5]]])
     z, ones = torch.tensor([[1.0, -1.0]]), torch.ones(1, 2)
@@ -90,7 +90,7 @@ def test_table_figures_and_plot(measured: tuple[Scene, Roofline], tmp_path: Path
 
 
 @pytest.mark.parametrize("wrong", [{"calls": 0}, {"copy_bytes": 0}])
-def test_what_must_be_positive(session: runtime.Session, wrong: dict[str, int]) -> None:
+def test_what_must_be_positive(session: opencl.Session, wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="`calls` and `copy_bytes` must be positive"):
         roofline(street(*SIZE, CHANNELS, 1.0), **wrong)
 
@@ -101,7 +101,7 @@ def test_settings_are_checked(wrong: dict[str, Any]) -> None:
         _roofline.main(RooflineBench(**wrong))
 
 
-def test_command(session: runtime.Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command(session: opencl.Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths: dict[str, Any] = {"json": tmp_path / "r.json", "markdown": tmp_path / "r.md", "plots": tmp_path / "plots"}
     config = RooflineBench(*SIZE, CHANNELS, (1.0, 2.0), calls=1, device=session.info.index, **paths)
     _roofline.main(config)

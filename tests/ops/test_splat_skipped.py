@@ -8,8 +8,7 @@ import torch
 from test_splat import Scene, all_of, detached, pile, scene
 from tolerances import assert_like_twin
 
-from vestcl import constants, reference
-from vestcl.opencl import session as runtime
+from vestcl import constants, opencl, reference
 from vestcl.ops.splat import Skipped, composite, rasterize, skipped, splat
 
 GEOMETRY = ("points_uv", "z", "radii", "opacities", "height", "width")
@@ -35,7 +34,7 @@ def layers(opacities: list[float], side: int) -> Scene:
     return {name: value.requires_grad_() for name, value in values.items()} | {"z": z, "height": side, "width": side}
 
 
-def test_each_reason_by_hand(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
+def test_each_reason_by_hand(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
     nan, inf, centre = float("nan"), float("inf"), (8.5, 8.5)
     rows = [  # u, v, z, radius, opacity
         (*centre, 1, 1, 1),
@@ -57,7 +56,7 @@ def test_each_reason_by_hand(mapped_session: runtime.Session, dtype: torch.dtype
 
 
 @pytest.mark.parametrize("min_transmittance", [0.0, 0.3])
-def test_like_the_twin(mapped_session: runtime.Session, dtype: torch.dtype, min_transmittance: float) -> None:
+def test_like_the_twin(mapped_session: opencl.Session, dtype: torch.dtype, min_transmittance: float) -> None:
     torch.manual_seed(5)
     arguments = scene(2, 400, 1, dtype)
     counted = skipped(rasterized(arguments), min_transmittance)
@@ -77,19 +76,19 @@ def test_like_the_twin(mapped_session: runtime.Session, dtype: torch.dtype, min_
     assert counted.saturated_pixels == int(((left == 0) | (left < min_transmittance)).sum()) > 0
 
 
-def test_nothing_to_show(mapped_session: runtime.Session) -> None:
+def test_nothing_to_show(mapped_session: opencl.Session) -> None:
     none = np.zeros((2, 0), np.float32)
     counted = skipped(rasterize(np.zeros((2, 0, 2), np.float32), none, none, none, 20, 37))
     assert (counted.points, counted.culled, counted.saturated_pixels) == (0, 0, 0)
     assert counted.tiles == counted.empty_tiles == 2 * 2 * 3
 
 
-def test_min_transmittance_is_checked(session: runtime.Session) -> None:
+def test_min_transmittance_is_checked(session: opencl.Session) -> None:
     with pytest.raises(ValueError, match="`min_transmittance` must be in"):
         skipped(rasterized(detached(pile([1.0], [1.0]))), 1.0)
 
 
-def test_points_of_opacity_zero_leave_no_trace(mapped_session: runtime.Session) -> None:
+def test_points_of_opacity_zero_leave_no_trace(mapped_session: opencl.Session) -> None:
     torch.manual_seed(3)
     arguments = detached(scene(2, 300, 4))
     arguments["opacities"][:, ::3] = 0
@@ -102,7 +101,7 @@ def test_points_of_opacity_zero_leave_no_trace(mapped_session: runtime.Session) 
         assert torch.equal(one, other)
 
 
-def test_opacity_zero_has_its_gradient(mapped_session: runtime.Session) -> None:
+def test_opacity_zero_has_its_gradient(mapped_session: opencl.Session) -> None:
     torch.manual_seed(4)
     arguments = scene(2, 300, 4)
     with torch.no_grad():
@@ -111,7 +110,7 @@ def test_opacity_zero_has_its_gradient(mapped_session: runtime.Session) -> None:
     assert_like_twin(splat, reference.splat, **arguments)
 
 
-def test_opacities_that_require_grad_too_late(session: runtime.Session) -> None:
+def test_opacities_that_require_grad_too_late(session: opencl.Session) -> None:
     arguments = detached(pile([0.5], [1.0]))
     raster = rasterized(arguments)
     arguments["opacities"].requires_grad_()
@@ -120,7 +119,7 @@ def test_opacities_that_require_grad_too_late(session: runtime.Session) -> None:
 
 
 @pytest.mark.parametrize("min_transmittance", [0.0, 0.01])
-def test_behind_opaque_layers(mapped_session: runtime.Session, min_transmittance: float) -> None:
+def test_behind_opaque_layers(mapped_session: opencl.Session, min_transmittance: float) -> None:
     """400 points on each of 4 x 4 pixels, the 100th opaque: the walk stops long before the list ends."""
     torch.manual_seed(6)
     arguments = layers([0.01] * 99 + [1.0] + [0.5] * 300, 4)
@@ -132,7 +131,7 @@ def test_behind_opaque_layers(mapped_session: runtime.Session, min_transmittance
 
 
 @pytest.mark.parametrize("min_transmittance", [0.0, 0.01])
-def test_behind_a_wall_across_tiles(mapped_session: runtime.Session, min_transmittance: float) -> None:
+def test_behind_a_wall_across_tiles(mapped_session: opencl.Session, min_transmittance: float) -> None:
     """Points at the corner of four tiles, behind a wall that is opaque in two of them."""
     torch.manual_seed(7)
     arguments, count = layers([1.0], 17), 900

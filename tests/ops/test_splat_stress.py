@@ -14,8 +14,7 @@ from hypothesis.extra.numpy import arrays
 from test_splat import INPUTS, Scene, all_of, assert_same_bits, detached, pile, scene
 from tolerances import assert_close, assert_like_twin
 
-from vestcl import reference
-from vestcl.opencl import session as runtime
+from vestcl import opencl, reference
 from vestcl.ops.splat import splat
 
 PER_POINT = ("points_uv", "z", "radii", "opacities", "features")
@@ -59,7 +58,7 @@ def assert_as_if_absent(arguments: Scene, index: int) -> None:
 # ---------------------------------------------------------------- many layers
 
 
-def test_many_layers_of_alpha_exactly_1(mapped_session: runtime.Session) -> None:
+def test_many_layers_of_alpha_exactly_1(mapped_session: opencl.Session) -> None:
     points = pile([1.0] * 600, list(range(600))) | {"backgrounds": torch.ones(1, 1)}
     image, coverage, *grads = all_of(recording(points))
     assert (image.item(), coverage.item()) == (0, 1)
@@ -69,7 +68,7 @@ def test_many_layers_of_alpha_exactly_1(mapped_session: runtime.Session) -> None
 
 @pytest.mark.parametrize("opacities", [(0.6, 1.0), (0.01, 0.02), (0.0, 1.0)])
 def test_a_thousand_layers(
-    mapped_session: runtime.Session, dtype: torch.dtype, long_lists: None, opacities: tuple[float, float]
+    mapped_session: opencl.Session, dtype: torch.dtype, long_lists: None, opacities: tuple[float, float]
 ) -> None:
     """On every pixel, for the radii are larger than the image. The fainter, the deeper it shows."""
     arguments = crowd(1000, size=4, dtype=dtype)
@@ -79,7 +78,7 @@ def test_a_thousand_layers(
     assert_like_twin(splat, reference.splat, **arguments)
 
 
-def test_a_million_points_in_one_tile(mapped_session: runtime.Session, long_lists: None) -> None:
+def test_a_million_points_in_one_tile(mapped_session: opencl.Session, long_lists: None) -> None:
     """4096 in each pixel, where one column of the tensors below lies, in the order of their depths."""
     depths = torch.randperm(1 << 20).float() + 1
     y, x = torch.arange(256) // 16 + 0.5, torch.arange(256) % 16 + 0.5
@@ -119,7 +118,7 @@ def spread(depths: str, count: int, dtype: torch.dtype) -> torch.Tensor:
 
 @pytest.mark.parametrize("depths", ["all equal", "two", "last bits", "last bits, one far", "descending", "wide"])
 @pytest.mark.parametrize("count", [20, 700])
-def test_any_depths_in_order(mapped_session: runtime.Session, dtype: torch.dtype, depths: str, count: int) -> None:
+def test_any_depths_in_order(mapped_session: opencl.Session, dtype: torch.dtype, depths: str, count: int) -> None:
     arguments = crowd(count, dtype=dtype) | {"z": spread(depths, count, dtype)}
     assert_like_twin(splat, reference.splat, **arguments)
 
@@ -128,14 +127,14 @@ def test_any_depths_in_order(mapped_session: runtime.Session, dtype: torch.dtype
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 50), (33, 1), (16, 16), (17, 15), (32, 64)])
-def test_image_sizes(mapped_session: runtime.Session, height: int, width: int) -> None:
+def test_image_sizes(mapped_session: opencl.Session, height: int, width: int) -> None:
     arguments = scene(2, 90, 3) | {"height": height, "width": width, "backgrounds": None}
     assert_like_twin(splat, reference.splat, **arguments)
 
 
 @pytest.mark.parametrize("min_transmittance", [0.0, 0.2])
 def test_footprints_over_many_tiles(
-    mapped_session: runtime.Session, float64: torch.dtype, min_transmittance: float
+    mapped_session: opencl.Session, float64: torch.dtype, min_transmittance: float
 ) -> None:
     """Up to 9 x 6 tiles, which takes as many launches, and lists of several segments."""
     arguments = scene(2, 60, 3, float64) | {"height": 90, "width": 130}
@@ -145,7 +144,7 @@ def test_footprints_over_many_tiles(
     assert_like_twin(splat, reference.splat, **arguments, min_transmittance=min_transmittance)
 
 
-def test_a_footprint_ends_where_the_distance_is_the_radius(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
+def test_a_footprint_ends_where_the_distance_is_the_radius(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
     """d2 < r^2, and both are exact here: of a row of pixels, a point on the first centre reaches r."""
     radii = torch.arange(1, 100, dtype=dtype)[:, None]
     ones = torch.ones_like(radii)
@@ -155,7 +154,7 @@ def test_a_footprint_ends_where_the_distance_is_the_radius(mapped_session: runti
 
 
 @pytest.mark.parametrize("radius", [-1.0, 0.0, 1e-6, 0.5, 1e4])
-def test_radii(mapped_session: runtime.Session, radius: float) -> None:
+def test_radii(mapped_session: opencl.Session, radius: float) -> None:
     arguments = scene(2, 90, 3)
     with torch.no_grad():
         arguments["radii"][:, ::3] = radius
@@ -166,7 +165,7 @@ def test_radii(mapped_session: runtime.Session, radius: float) -> None:
 @pytest.mark.parametrize(
     ("radius", "u"), [(1e-45, 3.5), (1e-30, 3.5), (1e-20, 3.5), (1e18, 3.5), (1e30, 3.5), (2e20, 1e20), (2e30, -1e30)]
 )
-def test_radii_whose_square_is_no_float32(mapped_session: runtime.Session, radius: float, u: float) -> None:
+def test_radii_whose_square_is_no_float32(mapped_session: opencl.Session, radius: float, u: float) -> None:
     """They make fragments or not, but no gradient that isn't finite."""
     arguments = scene(1, 90, 3)
     with torch.no_grad():
@@ -176,7 +175,7 @@ def test_radii_whose_square_is_no_float32(mapped_session: runtime.Session, radiu
 
 
 @pytest.mark.parametrize("u", [1e30, -1e30, 3e38])
-def test_points_far_outside_are_absent(mapped_session: runtime.Session, u: float) -> None:
+def test_points_far_outside_are_absent(mapped_session: opencl.Session, u: float) -> None:
     arguments = crowd(60)
     for far in ((u, 3.0), (3.0, u), (u, u), (u, -u)):
         with torch.no_grad():
@@ -185,14 +184,14 @@ def test_points_far_outside_are_absent(mapped_session: runtime.Session, u: float
 
 
 @pytest.mark.parametrize("z", [0.0, -0.0, -1.0, 1e-40, 0.0999, -1e30])
-def test_points_before_the_near_plane_are_absent(mapped_session: runtime.Session, z: float) -> None:
+def test_points_before_the_near_plane_are_absent(mapped_session: opencl.Session, z: float) -> None:
     arguments = crowd(60)
     arguments["z"][0, 7] = z
     assert_as_if_absent(arguments, 7)
 
 
 @pytest.mark.parametrize("z", [0.1, 1e30, 3e38])
-def test_depths_that_show(mapped_session: runtime.Session, dtype: torch.dtype, z: float) -> None:
+def test_depths_that_show(mapped_session: opencl.Session, dtype: torch.dtype, z: float) -> None:
     points = pile([1.0], [3.0], dtype=dtype)
     assert splat(**(points | {"z": torch.tensor([[z]], dtype=dtype)}))[0].item() == 3
 
@@ -202,7 +201,7 @@ def test_depths_that_show(mapped_session: runtime.Session, dtype: torch.dtype, z
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", PER_POINT)
-def test_points_that_are_not_finite_are_absent(mapped_session: runtime.Session, name: str, bad: float) -> None:
+def test_points_that_are_not_finite_are_absent(mapped_session: opencl.Session, name: str, bad: float) -> None:
     """Also where one number of several is bad, and where many points are."""
     arguments = crowd(60, channels=5)
     with torch.no_grad():
@@ -214,7 +213,7 @@ def test_points_that_are_not_finite_are_absent(mapped_session: runtime.Session, 
 
 
 @pytest.mark.parametrize("layers", [64, 128, 256, 512])
-def test_a_point_that_is_not_finite_behind_opaque_ones(mapped_session: runtime.Session, layers: int) -> None:
+def test_a_point_that_is_not_finite_behind_opaque_ones(mapped_session: opencl.Session, layers: int) -> None:
     """dL/da of the opaque one is f less what lies behind it: that is the point after the next, at any list length."""
     faint, behind = [0.001] * (layers - 1), [0.5] * 9
     features = [*torch.randn(layers).tolist(), math.nan, *range(8)]
@@ -225,7 +224,7 @@ def test_a_point_that_is_not_finite_behind_opaque_ones(mapped_session: runtime.S
 # ---------------------------------------------------------------- opacities and truncation
 
 
-def test_opacity_0_has_a_gradient(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
+def test_opacity_0_has_a_gradient(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
     arguments = crowd(60, dtype=dtype)
     with torch.no_grad():
         arguments["opacities"][0, ::2] = 0
@@ -238,7 +237,7 @@ def test_opacity_0_has_a_gradient(mapped_session: runtime.Session, dtype: torch.
     assert grads[2].count_nonzero() == 60 and not grads[0].any() and not grads[1].any() and not grads[3].any()
 
 
-def test_opacities_outside_0_to_1_are_used_as_they_stand(mapped_session: runtime.Session) -> None:
+def test_opacities_outside_0_to_1_are_used_as_they_stand(mapped_session: opencl.Session) -> None:
     arguments = scene(1, 60, 3)
     with torch.no_grad():
         arguments["opacities"] *= torch.randn(1, 60)
@@ -246,7 +245,7 @@ def test_opacities_outside_0_to_1_are_used_as_they_stand(mapped_session: runtime
 
 
 @pytest.mark.parametrize("min_transmittance", [0.5, 0.01, 1e-4])
-def test_error_of_truncation(mapped_session: runtime.Session, min_transmittance: float) -> None:
+def test_error_of_truncation(mapped_session: opencl.Session, min_transmittance: float) -> None:
     arguments = detached(crowd(600))
     (image, coverage), (exact, covered) = splat(**arguments, min_transmittance=min_transmittance), splat(**arguments)
     contrast = (arguments["features"] - arguments["backgrounds"][:, None]).abs().max()
@@ -288,7 +287,7 @@ def scenes(draw: st.DrawFn) -> Scene:
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 @given(arguments=scenes())
-def test_any_scene_like_twin(mapped_session: runtime.Session, float64: torch.dtype, arguments: Scene) -> None:
+def test_any_scene_like_twin(mapped_session: opencl.Session, float64: torch.dtype, arguments: Scene) -> None:
     (image, coverage), (twins_image, twins_coverage) = splat(**arguments), reference.splat(**arguments)
     inputs = [arguments[name] for name in INPUTS]
     grads = torch.autograd.grad(image.square().sum() + coverage.sum(), inputs)

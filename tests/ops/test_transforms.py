@@ -11,8 +11,7 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from vestcl import reference
-from vestcl.opencl import session as runtime
+from vestcl import opencl, reference
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.splat import Raster, composite, rasterize, splat
@@ -123,7 +122,7 @@ def test_tracing_is_refused() -> None:
         unproject(fake, CAMERA)
 
 
-def test_functional_call(session: runtime.Session) -> None:
+def test_functional_call(session: opencl.Session) -> None:
     class Scene(torch.nn.Module):
         def __init__(self) -> None:
             super().__init__()
@@ -147,12 +146,12 @@ def raster_of(values: dict[str, torch.Tensor]) -> Raster[torch.Tensor]:
     [copy.deepcopy, pickle.dumps, lambda raster: torch.save(raster, io.BytesIO()), lambda r: copy.deepcopy({"r": [r]})],
     ids=["deepcopy", "pickle", "torch.save", "inside"],
 )
-def test_a_raster_is_not_duplicated(session: runtime.Session, duplicate: Callable[[Any], Any]) -> None:
+def test_a_raster_is_not_duplicated(session: opencl.Session, duplicate: Callable[[Any], Any]) -> None:
     with pytest.raises(TypeError, match=r"a Raster can't be deep-copied or pickled.* call vestcl.rasterize again"):
         duplicate(raster_of(cloud()))
 
 
-def test_a_shallow_copy_of_a_raster_is_the_raster(session: runtime.Session) -> None:
+def test_a_shallow_copy_of_a_raster_is_the_raster(session: opencl.Session) -> None:
     values = cloud()
     raster = raster_of(values)
     wanted = composite(raster, values["features"])
@@ -183,7 +182,7 @@ CHANGES: Final[dict[str, tuple[Callable[[torch.Tensor], Any], Callable[[torch.Te
 
 @pytest.mark.parametrize("which", [0, 1, 2])
 @pytest.mark.parametrize("change", CHANGES)
-def test_outputs_of_splat_change_in_place(mapped_session: runtime.Session, change: str, which: int) -> None:
+def test_outputs_of_splat_change_in_place(mapped_session: opencl.Session, change: str, which: int) -> None:
     """Image, coverage or both: the right values and the right gradients."""
     in_place, out_of_place = CHANGES[change]
     values = cloud()
@@ -202,7 +201,7 @@ def test_outputs_of_splat_change_in_place(mapped_session: runtime.Session, chang
 
 
 @pytest.mark.parametrize("name", ["unproject", "rigid_flow", "displace"])
-def test_other_outputs_change_in_place(session: runtime.Session, name: str) -> None:
+def test_other_outputs_change_in_place(session: opencl.Session, name: str) -> None:
     function, value = of_one(name, TAKES[name][0])
     value.requires_grad_()
     got, wanted = (
@@ -212,7 +211,7 @@ def test_other_outputs_change_in_place(session: runtime.Session, name: str) -> N
     assert torch.equal(got, wanted)
 
 
-def test_numpy_outputs_change_in_place(session: runtime.Session) -> None:
+def test_numpy_outputs_change_in_place(session: opencl.Session) -> None:
     arrays = {name: value.numpy() for name, value in cloud().items()}
     image, coverage = splat(**arrays, height=6, width=5)
     image += 1
@@ -221,7 +220,7 @@ def test_numpy_outputs_change_in_place(session: runtime.Session) -> None:
 
 
 @pytest.mark.parametrize("name", POINTS)
-def test_a_geometry_that_was_changed_in_place_is_refused(session: runtime.Session, name: str) -> None:
+def test_a_geometry_that_was_changed_in_place_is_refused(session: opencl.Session, name: str) -> None:
     """The raster shows the old numbers: sent on through the new ones, its gradient would be another's."""
     values = cloud()
     leaf = values[name].requires_grad_()
@@ -234,7 +233,7 @@ def test_a_geometry_that_was_changed_in_place_is_refused(session: runtime.Sessio
         composite(raster, values["features"])
 
 
-def test_a_geometry_that_changes_without_a_graph_keeps_its_gradient(session: runtime.Session) -> None:
+def test_a_geometry_that_changes_without_a_graph_keeps_its_gradient(session: opencl.Session) -> None:
     values = cloud()
     leaves = [values[name].requires_grad_() for name in POINTS]
     truth = torch.autograd.grad(reference.splat(**values, height=6, width=5)[0].sum(), leaves)

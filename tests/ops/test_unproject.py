@@ -8,8 +8,7 @@ import torch
 from tolerances import assert_close, assert_like_twin
 from torch.autograd import gradcheck
 
-from vestcl import reference
-from vestcl.opencl import session as runtime
+from vestcl import opencl, reference
 from vestcl.ops.unproject import unproject
 
 
@@ -22,7 +21,7 @@ def depth_map(batch: int, height: int, width: int, dtype: torch.dtype) -> torch.
     return (torch.rand(batch, 1, height, width, dtype=dtype) * 60 + 2).requires_grad_()
 
 
-def test_by_hand(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
+def test_by_hand(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
     K = torch.tensor([[[2.0, 0, 1], [0, 4, 1], [0, 0, 1]]], dtype=dtype)
     depth = torch.tensor([[[[2.0, 4], [8, 0]]]], dtype=dtype)
     wanted = [[-0.5, -0.25, 2], [1, -0.5, 4], [-2, 1, 8], [0, 0, 0]]
@@ -30,23 +29,23 @@ def test_by_hand(mapped_session: runtime.Session, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize(("batch", "height", "width"), [(1, 1, 1), (3, 11, 17), (2, 2, 5000)])
-def test_like_twin(mapped_session: runtime.Session, dtype: torch.dtype, batch: int, height: int, width: int) -> None:
+def test_like_twin(mapped_session: opencl.Session, dtype: torch.dtype, batch: int, height: int, width: int) -> None:
     depth, K = depth_map(batch, height, width, dtype), camera(batch, dtype)
     assert_like_twin(unproject, reference.unproject, depth=depth, K=K)
 
 
-def test_gradcheck(mapped_session: runtime.Session, float64: torch.dtype) -> None:
+def test_gradcheck(mapped_session: opencl.Session, float64: torch.dtype) -> None:
     assert gradcheck(unproject, (depth_map(2, 3, 4, float64), camera(2, float64)))
 
 
-def test_numpy_in_numpy_out(session: runtime.Session, dtype: torch.dtype) -> None:
+def test_numpy_in_numpy_out(session: opencl.Session, dtype: torch.dtype) -> None:
     depth, K = depth_map(2, 3, 4, dtype).detach(), camera(2, dtype)
     points_xyz = unproject(depth.numpy(), K.numpy())
     assert isinstance(points_xyz, np.ndarray) and points_xyz.shape == (2, 12, 3)
     assert np.array_equal(points_xyz, unproject(depth, K).numpy())
 
 
-def test_any_strides(session: runtime.Session) -> None:
+def test_any_strides(session: opencl.Session) -> None:
     depth, K = depth_map(2, 6, 8, torch.float32).detach(), camera(2, torch.float32)
     wanted = unproject(depth, K)
     slanted = depth.transpose(2, 3).contiguous().transpose(2, 3)
@@ -60,7 +59,7 @@ def test_any_strides(session: runtime.Session) -> None:
     assert np.array_equal(unproject(frozen, K.numpy()), wanted.numpy())
 
 
-def test_gradient_of_an_expanded_loss(session: runtime.Session) -> None:
+def test_gradient_of_an_expanded_loss(session: opencl.Session) -> None:
     depth, K = depth_map(1, 2, 3, torch.float32), camera(1, torch.float32)
     unproject(depth, K).sum().backward()
     assert depth.grad is not None
@@ -68,7 +67,7 @@ def test_gradient_of_an_expanded_loss(session: runtime.Session) -> None:
 
 
 @pytest.mark.parametrize("shape", [(0, 1, 2, 3), (2, 1, 0, 3), (2, 1, 2, 0)])
-def test_nothing_to_do(session: runtime.Session, shape: tuple[int, ...]) -> None:
+def test_nothing_to_do(session: opencl.Session, shape: tuple[int, ...]) -> None:
     depth = torch.zeros(shape, requires_grad=True)
     points_xyz = unproject(depth, camera(shape[0], torch.float32))
     assert points_xyz.shape == (shape[0], shape[2] * shape[3], 3)
@@ -76,7 +75,7 @@ def test_nothing_to_do(session: runtime.Session, shape: tuple[int, ...]) -> None
     assert depth.grad is not None and depth.grad.shape == shape
 
 
-def test_nan_stays_in_its_point(session: runtime.Session) -> None:
+def test_nan_stays_in_its_point(session: opencl.Session) -> None:
     depth, K = depth_map(1, 3, 4, torch.float32), camera(1, torch.float32)
     with torch.no_grad():
         depth[0, 0, 1, 2] = torch.nan
@@ -86,7 +85,7 @@ def test_nan_stays_in_its_point(session: runtime.Session) -> None:
     assert depth.grad is not None and depth.grad.isfinite().all()
 
 
-def test_same_bits_twice(mapped_session: runtime.Session) -> None:
+def test_same_bits_twice(mapped_session: opencl.Session) -> None:
     depth, K = depth_map(2, 40, 70, torch.float32), camera(2, torch.float32)
     first, second = unproject(depth, K), unproject(depth, K)
     assert torch.equal(first, second)
@@ -96,9 +95,9 @@ def test_same_bits_twice(mapped_session: runtime.Session) -> None:
 
 def test_backward_runs_where_forward_ran() -> None:
     depth = depth_map(1, 2, 3, torch.float32)
-    with runtime.use(mapping="pixel") as session:
+    with opencl.use(mapping="pixel") as session:
         points_xyz = unproject(depth, camera(1, torch.float32))
-    assert runtime.current() is not session
+    assert opencl.current() is not session
     with session.profile() as times:
         points_xyz.sum().backward()
     assert [time.name for time in times] == ["unproject_backward"]

@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import torch
 
-from vestcl.opencl import session as runtime
+from vestcl import opencl
 from vestcl.ops.splat import splat
 
 SCENES: Final = 20_000
@@ -81,7 +81,7 @@ class Tally:
 
 def programs(count: int, rng: np.random.Generator) -> list[Program]:
     """The first ones are those that the operator's own tests build as well."""
-    dtypes = ("float32", "float64") if runtime.current().info.float64 else ("float32",)
+    dtypes = ("float32", "float64") if opencl.current().info.float64 else ("float32",)
     plain = [
         Program(dtype, mapping, truncate, 3 if truncate else 5)
         for dtype in dtypes for mapping in ("tile", "pixel") for truncate in (False, True)
@@ -328,7 +328,7 @@ def run_operator(scene: dict[str, Any], program: Program, g: Array, h: Array) ->
     }
     asked = [given[name].requires_grad_() for name in program.asked]
     sizes = {name: scene[name] for name in ("height", "width", "min_transmittance")}
-    with runtime.use(mapping=program.mapping):
+    with opencl.use(mapping=program.mapping):
         outputs = splat(**given, **sizes, cloud_starts=torch.from_numpy(scene["cloud_starts"]) if not lead else None)
     shown = [output.detach().flatten(2).mT.numpy() for output in outputs]
     shape = (batch, scene["height"], scene["width"])

@@ -33,7 +33,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))  # the checkout's vestcl, whichever is installed
 
 import vestcl  # noqa: E402
-from vestcl.opencl import session as runtime  # noqa: E402
+from vestcl import opencl  # noqa: E402
 
 INTERRUPTS: Final = 2000
 #: Calls after the interrupts, which are compared with a fresh process.
@@ -82,7 +82,7 @@ def call(case: Case, seed: int = 0) -> list[torch.Tensor]:
     motion = [torch.tensor([[1.0, 0.01, 0.02, 0.0]]), torch.tensor([[0.1, 0.0, -0.2]])]
     inputs = [value.requires_grad_(case.backward) for value in (depth, features, *motion)]
     K = torch.tensor([[[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]])
-    with runtime.use(mapping=case.mapping) as session:
+    with opencl.use(mapping=case.mapping) as session:
         points_xyz = vestcl.unproject(depth, K)
         points_uv, z = vestcl.displace(points_xyz, vestcl.rigid_flow(points_xyz, *motion), K)
         opacities = features[..., 0].sigmoid()
@@ -108,7 +108,7 @@ def last_calls() -> list[str]:
 def prepare() -> None:
     """The device's sessions; the one of the mapping "pixel" copies, as a GPU's does."""
     torch.set_num_threads(1)
-    with runtime.use(mapping="pixel") as session:
+    with opencl.use(mapping="pixel") as session:
         session.shares_host_memory = False
 
 

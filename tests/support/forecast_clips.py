@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from data_files import write_pictures, write_text
 
+from vestcl import opencl
 from vestcl.data.sample import Clip
 from vestcl.forecasting.result import Forecast, Rendered, View
-from vestcl.opencl import session as runtime
 
 HEIGHT, WIDTH, FRAMES = 24, 40, 6
 
@@ -37,7 +37,7 @@ class Repeater:
         **mode: str,
     ) -> Forecast:
         self.calls.append((clip, index, steps, list(views)))
-        self.devices.append(runtime.current().info.index)
+        self.devices.append(opencl.current().info.index)
         self.networks.append((*network, *mode.values()))
         image = clip[index + self.shift].read_image()
         plane = np.ones_like(image[:1])

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from vestcl import opencl
 from vestcl.data import Street, intrinsics
-from vestcl.opencl import session as runtime
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.splat import composite, rasterize
@@ -35,7 +35,7 @@ CHECKS = ("--data-races", "--max-errors", "100000")
 OPTIONS = {"splat": CHECKS, "street": (*CHECKS, "--build-options", "-cl-opt-disable")}
 
 
-def exact_scratch(job: runtime.Job, count: int, dtype: Any) -> runtime.Buffer:
+def exact_scratch(job: opencl.Job, count: int, dtype: Any) -> opencl.Buffer:
     """Memory of the very size asked for: the pool's is larger, and an access beyond it would not show."""
     return job.write(np.empty(max(1, count) * np.dtype(dtype).itemsize, np.uint8))
 
@@ -90,16 +90,16 @@ def splatting(dtype: torch.dtype) -> None:
 
 
 def splat_and_small_operators() -> None:
-    setattr(runtime.Job, "scratch", exact_scratch)  # noqa: B010 - a method may not be assigned to
+    setattr(opencl.Job, "scratch", exact_scratch)  # noqa: B010 - a method may not be assigned to
     for mapping in ("tile", "pixel"):
-        with runtime.use("oclgrind", mapping):
+        with opencl.use("oclgrind", mapping):
             for dtype in (torch.float32, torch.float64):
                 small_operators(dtype)
                 splatting(dtype)
 
 
 def street() -> None:
-    with runtime.use("oclgrind"):
+    with opencl.use("oclgrind"):
         scene = Street.generate(1)
         scene.render(np.linalg.inv(scene.camera_pose(2.0)), intrinsics(HEIGHT, WIDTH), HEIGHT, WIDTH, 2.0)
 

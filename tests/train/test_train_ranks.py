@@ -18,8 +18,8 @@ from train.fit import TrainingError
 from train.run.ranks import LostProcessError, Ranks, lost_processes_named
 from train.run.report import LOG, read_log
 from train.run.trainer import build_model
+from vestcl import opencl
 from vestcl.models import config
-from vestcl.opencl import session as runtime
 
 #: Two processes' weights beside one's, relative to how far training has moved them. 6e-8 were measured, for the halves
 #: of a batch of two add up alike; elsewhere rounding may count for more, as Adam divides gradients by their own size.
@@ -123,8 +123,8 @@ def test_devices_are_dealt_in_turn(
 ) -> None:
     """To the processes of one machine, wherever they rank among all; CPUs are shared."""
     infos = [Info(*each) for each in devices]
-    monkeypatch.setattr(runtime, "devices", lambda: infos)
-    monkeypatch.setattr(runtime, "select", lambda: infos[0])
+    monkeypatch.setattr(opencl, "devices", lambda: infos)
+    monkeypatch.setattr(opencl, "select", lambda: infos[0])
     assert [Ranks(rank=4 + local, world=8, local=local).device() for local in range(3)] == wanted
 
 

@@ -14,7 +14,7 @@ from torch import distributed
 from torch.distributed.distributed_c10d import PrefixStore
 from torch.distributed.rendezvous import rendezvous
 
-from vestcl.opencl import session as runtime
+from vestcl import opencl
 
 #: A process that does not answer for so long is given up, and torchrun starts all of them anew.
 PATIENCE: Final = timedelta(minutes=10)
@@ -92,8 +92,8 @@ class Ranks:
         Returns:
             Its index in `vestcl devices`; None is the default, where there is but one of its kind.
         """
-        default = runtime.select()
-        alike = [each.index for each in runtime.devices() if each.kind == default.kind != "CPU"]
+        default = opencl.select()
+        alike = [each.index for each in opencl.devices() if each.kind == default.kind != "CPU"]
         return alike[self.local % len(alike)] if alike else None
 
     def leave(self) -> None:

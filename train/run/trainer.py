@@ -14,10 +14,10 @@ from train.data.windows import Batch
 from train.run.losses import Perceptual, total_loss
 from train.run.ranks import Ranks
 from train.settings.config import Config, Stage
+from vestcl import opencl
 from vestcl.models.config import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster, RenderedView, Step
 from vestcl.models.networks.encoder import load_resnet34
-from vestcl.opencl import session as runtime
 
 _PRECISIONS: Final = {"float32": None, "bfloat16": torch.bfloat16}
 
@@ -139,7 +139,7 @@ class Trainer:
         Raises:
             NotANumberError: a loss or gradient is not finite, and ``run.on_nan`` is "stop"; the weights are as before.
         """
-        start, session = time.perf_counter(), runtime.current()
+        start, session = time.perf_counter(), opencl.current()
         splatting = session.seconds
         self.adam.zero_grad(set_to_none=True)
         step: Step = self._model(

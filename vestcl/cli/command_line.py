@@ -103,8 +103,8 @@ def run(parse: Callable[[], Parsed], own: bool) -> int:
 def is_known(error: Exception) -> bool:
     """Whether ``error`` is one that the user can correct; other errors are vestcl's own, and need their traceback."""
     # Where nothing has loaded the module, which takes a tenth of a second, no error is from there.
-    runtime = sys.modules.get("vestcl.opencl.session")
-    if runtime is not None and isinstance(error, runtime.DeviceError):
+    errors = sys.modules.get("vestcl.opencl.errors")
+    if errors is not None and isinstance(error, errors.DeviceError):
         return True
     if isinstance(error, RuntimeError):
         return any(words in str(error) for words in _NO_MEMORY)

@@ -22,14 +22,14 @@ class Devices:
 
     def run(self) -> int:
         """Print the table."""
-        from vestcl.opencl import session as runtime
+        from vestcl import opencl
 
-        used = runtime.select()
+        used = opencl.select()
         table = Table("", "index", box=box.SIMPLE, padding=0)
         table.add_column("device, platform, driver", overflow="fold")
         for heading in ("type", "units", "GiB", "local KiB", "float64", "OpenCL"):
             table.add_column(heading)
-        for info in runtime.devices():
+        for info in opencl.devices():
             table.add_row(
                 *("*" if info == used else "", info.index),
                 Text(f"{info.name}\n{info.platform} {info.driver.split(' / ')[-1]}"),
@@ -97,10 +97,10 @@ class Demo:
 
     def run(self) -> int:
         """Write the pictures."""
+        from vestcl import opencl
         from vestcl.cli import demo
-        from vestcl.opencl import session as runtime
 
-        with runtime.use(self.device):
+        with opencl.use(self.device):
             demo.run(self.out, self.height, self.width, self.seed, self.model, self.quality)
         return 0
 

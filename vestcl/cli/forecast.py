@@ -15,6 +15,7 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
+from vestcl import opencl
 from vestcl.cli.options import check_pixels
 from vestcl.cli.progress import Bar
 from vestcl.data.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
@@ -31,7 +32,6 @@ from vestcl.forecasting.result import Forecast, Skipped, View
 from vestcl.forecasting.views import parse_views
 from vestcl.io import contact_sheet as sheet
 from vestcl.models.inference import pretrained, quality
-from vestcl.opencl import session as runtime
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def run(options: "cli.Forecast") -> None:
     console = Console()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     bar = Bar(*columns, console=console, transient=True, disable=not console.is_terminal)
-    with runtime.use(options.device), bar:
+    with opencl.use(options.device), bar:
         stages = _Stages(bar)
         with stages.stage("open the clip"):
             level = options.quality or quality.USUAL

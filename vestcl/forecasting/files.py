@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vestcl import __version__
+from vestcl import __version__, opencl
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
 from vestcl.forecasting.result import Forecast, Rendered, View
@@ -35,7 +35,6 @@ from vestcl.io.contact_sheet import Picture
 from vestcl.io.exr import ExrFrame, read_exr_frame, write_exr_frame
 from vestcl.io.images import read_image, to_pixels, write_image, write_pixels
 from vestcl.io.video.writing import encoder_note, write_gif, write_mp4
-from vestcl.opencl import session as runtime
 
 #: Raised when a reader of earlier files would misread newer ones.
 FORMAT: Final = "vestcl forecast 1"
@@ -188,7 +187,7 @@ def read_forecast(out: str | Path) -> SavedForecast:
 
 def machine() -> dict[str, Any]:
     """What computed it: {"versions": {...}, "device": {...}}, the latter of the OpenCL device in use."""
-    info = runtime.current().info
+    info = opencl.current().info
     return {
         "versions": {
             "vestcl": __version__,

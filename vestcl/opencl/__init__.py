@@ -1,1 +1,48 @@
-"""Devices, programs, sessions and host memory: the only importer of pyopencl."""
+"""Devices, programs, sessions and host memory: the only importer of pyopencl. Importing it opens no device."""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # all load on first use: what needs no device is to start at once
+    from vestcl.opencl.device_list import DeviceInfo, devices, select
+    from vestcl.opencl.errors import DeviceError
+    from vestcl.opencl.programs import Defines, defines_for, kernel_folder, source
+    from vestcl.opencl.selection import current, free_scratch, open_session, use
+    from vestcl.opencl.session import Argument, Buffer, Job, JobTimes, KernelTime, Launch, Session, observe
+
+__all__ = [
+    "Argument",
+    "Buffer",
+    "Defines",
+    "DeviceError",
+    "DeviceInfo",
+    "Job",
+    "JobTimes",
+    "KernelTime",
+    "Launch",
+    "Session",
+    "current",
+    "defines_for",
+    "devices",
+    "free_scratch",
+    "kernel_folder",
+    "observe",
+    "open_session",
+    "select",
+    "source",
+    "use",
+]
+
+_FILES = {
+    **dict.fromkeys(("current", "free_scratch", "open_session", "use"), "selection"),
+    **dict.fromkeys(("DeviceInfo", "devices", "select"), "device_list"),
+    "DeviceError": "errors",
+    **dict.fromkeys(("Defines", "defines_for", "kernel_folder", "source"), "programs"),
+    **dict.fromkeys(("Argument", "Buffer", "Job", "JobTimes", "KernelTime", "Launch", "Session", "observe"), "session"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _FILES:
+        raise AttributeError(f"module 'vestcl.opencl' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"vestcl.opencl.{_FILES[name]}"), name)

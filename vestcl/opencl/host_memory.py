@@ -7,8 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from vestcl import constants
-from vestcl.opencl import session as runtime
+from vestcl import constants, opencl
 
 Array = np.ndarray[Any, Any]
 
@@ -141,4 +140,4 @@ def free_memory() -> None:
     memory. It waits for the operators that other threads run now. The next calls are slower, for they ask for it again.
     """
     _host_pool.free()
-    runtime.free_scratch()
+    opencl.free_scratch()

@@ -1,9 +1,9 @@
-"""OpenCL devices, programs and launches. The only module that imports pyopencl, and it opens no device on import.
+"""Sessions and jobs: an open device, and the arrays and launches of one operator call.
 
 An operator runs as one `Job`: arrays are bound, kernels enqueued, and leaving the ``with`` block waits and
 makes the results visible::
 
-    session = runtime.current()
+    session = opencl.current()
     with session.job() as job:
         job.launch("unproject.cl", "unproject", {"REAL": "float"}, (count,), [np.int32(count), job.read(depth), ...])
 
@@ -12,56 +12,30 @@ next one clears away: it waits for kernels that still run, and only then lets go
 """
 
 import atexit
-import contextvars
-import ctypes
 import functools
-import os
-import re
 import threading
 import time
-import warnings
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.tools
 
-from vestcl import constants
-from vestcl.opencl import icd, pocl_cache, pocl_cpu
+from vestcl.opencl import forks, pocl_cache, pocl_cpu
+from vestcl.opencl.device_list import DeviceInfo
+from vestcl.opencl.errors import DeviceError
+from vestcl.opencl.forks import refuse_after_fork, was_forked
+from vestcl.opencl.programs import Defines, source
 from vestcl.opencl.robust_lock import Holder, RobustLock, WithBlock
 
-Defines = Mapping[str, str | int]
 Buffer = cl.MemoryObjectHolder
 Argument = Buffer | np.generic
 
 #: Readings of a device's clock: what delays one of them does not delay the best.
 _CLOCK_READINGS: Final = 8
-
-
-class DeviceError(RuntimeError):
-    """No OpenCL device as asked for, or one that can't do what an operator needs. The message names the remedy."""
-
-
-@dataclass(frozen=True)
-class DeviceInfo:
-    """What `vestcl devices` prints about one OpenCL device."""
-
-    index: str
-    """``platform:device``, a valid value of VESTCL_DEVICE."""
-    platform: str
-    name: str
-    kind: str
-    """"CPU", "GPU" or "accelerator"."""
-    compute_units: int
-    memory_gib: float
-    local_memory_kib: float
-    float64: bool
-    version: str
-    driver: str
 
 
 @dataclass(frozen=True)
@@ -97,232 +71,22 @@ class JobTimes:
     launches: tuple[Launch, ...]
 
 
-# ---------------------------------------------------------------- processes
-
-#: Whether OpenCL's drivers were loaded: their threads run from then on.
-_opencl_runs = False
-#: Whether this process was forked off one where they ran. Their threads are not in it: whoever waits for them, hangs.
-_forked = False
+_sessions: "weakref.WeakSet[Session]" = weakref.WeakSet()
 
 
-def _refuse_after_fork() -> None:
-    if _forked:
-        raise DeviceError(
-            "OpenCL was used before this process was forked, and does not work after a fork: start processes with the "
-            "method 'spawn' or 'forkserver' (multiprocessing.get_context('spawn'), for a DataLoader "
-            "multiprocessing_context='spawn'), or use vestcl's devices only after the fork"
-        )
-
-
-def _after_fork() -> None:
-    """In the child: refuse what would hang, and never destroy OpenCL's objects, for that may hang, too."""
-    global _forked
-    if _opencl_runs:
-        _forked = True
-        for session in _sessions:
-            ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
+def sessions() -> "Iterable[Session]":
+    """Those of every open device."""
+    return tuple(_sessions)
 
 
 def _before_exit() -> None:
     """Wait for kernels of an interrupted job: their arrays are about to go."""
-    for session in () if _forked else tuple(_sessions):
+    for session in () if was_forked() else tuple(_sessions):
         if session._unfinished:
             session._queue.finish()
 
 
-_sessions: "weakref.WeakSet[Session]" = weakref.WeakSet()
 atexit.register(_before_exit)
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
-
-
-# ---------------------------------------------------------------- devices
-
-
-@functools.cache
-def _all_devices() -> tuple[tuple[DeviceInfo, cl.Device], ...]:
-    global _opencl_runs
-    _opencl_runs = True
-    cache = pocl_cache.ensure()  # PoCL reads where it is when it is loaded
-    if pocl_cache.wrappers_cache_fault():
-        cl._PYOPENCL_NO_CACHE = True  # of PYOPENCL_NO_CACHE, which is read when pyopencl is imported
-    try:
-        platforms = cl.get_platforms()
-    except cl.LogicError as error:  # the loader's way to say that there are none
-        if "PLATFORM_NOT_FOUND" not in str(error):
-            raise
-        platforms = []
-    found = []
-    for p, platform in enumerate(platforms):
-        try:
-            devices = platform.get_devices()
-        except cl.Error:  # a platform without devices (rusticl without RUSTICL_ENABLE) is no reason to fail
-            continue
-        for d, device in enumerate(devices):
-            if pocl_cpu.is_unnamed(platform.version, device.version):
-                pocl_cpu.name_cpu(device.int_ptr)
-            found.append((_describe(f"{p}:{d}", platform, device), device))
-    if cache.note and any("PoCL" in info.version for info, _ in found):
-        warnings.warn(cache.note, stacklevel=2)
-    return tuple(found)
-
-
-def _describe(index: str, platform: cl.Platform, device: cl.Device) -> DeviceInfo:
-    kinds = {cl.device_type.CPU: "CPU", cl.device_type.GPU: "GPU"}
-    return DeviceInfo(
-        index=index,
-        platform=platform.name.strip(),
-        name=device.name.strip(),
-        kind=next((kind for flag, kind in kinds.items() if device.type & flag), "accelerator"),
-        compute_units=device.max_compute_units,
-        memory_gib=device.global_mem_size / 2**30,
-        local_memory_kib=device.local_mem_size / 2**10,
-        float64="cl_khr_fp64" in device.extensions,
-        version=device.version.strip(),
-        driver=f"{platform.version.strip()} / {device.driver_version.strip()}",
-    )
-
-
-def devices() -> list[DeviceInfo]:
-    """Every device of every OpenCL platform, in the loader's order.
-
-    Raises:
-        DeviceError: in a process that was forked after OpenCL was used.
-    """
-    _refuse_after_fork()
-    return [info for info, _ in _all_devices()]
-
-
-def select(selector: str | None = None) -> DeviceInfo:
-    """The device that ``selector`` means.
-
-    Args:
-        selector: ``"0:1"`` (platform:device), or a part of the platform's, device's or driver's name in any case, such
-            as ``"pocl"``, ``"intel"``, ``"nvidia"``. None: the environment variable VESTCL_DEVICE, and without
-            it the first PoCL (pip installs one), else the first CPU, else the first device.
-
-    Raises:
-        DeviceError: no device fits, and the message lists those that there are; or as in `devices`.
-    """
-    name, selector = ("`device`", selector) if selector else ("VESTCL_DEVICE", os.environ.get("VESTCL_DEVICE"))
-    infos = devices()
-    if not infos:
-        raise DeviceError(icd.no_device())
-    if selector is None:
-        return min(infos, key=lambda info: (info.kind != "CPU", "PoCL" not in info.version))
-    if re.fullmatch(r"\d+:\d+", selector):
-        chosen = [info for info in infos if info.index == selector]
-    else:
-        text = selector.lower()
-        chosen = [i for i in infos if text in f"{i.platform} {i.name} {i.version} {i.driver}".lower()]
-    if not chosen:
-        known = "; ".join(f"{info.index} {info.platform} / {info.name}" for info in infos)
-        raise DeviceError(f"{name} {selector!r} fits none of the OpenCL devices: {known}")
-    return chosen[0]
-
-
-_selected: contextvars.ContextVar["use | None"] = contextvars.ContextVar("vestcl_device", default=None)
-
-
-class use(WithBlock):  # noqa: N801 - reads as a verb, like contextlib.suppress
-    """Run vestcl's operators on another device: from here on, or inside a ``with`` block.
-
-    It holds for the thread that calls it; other threads start with the default device (set VESTCL_DEVICE for all).
-    Gradients are computed on the device that their forward ran on.
-
-    Args:
-        selector: as in `select`.
-        mapping: how work is laid out, "tile" (a work-item a tile, for CPUs) or "pixel" (a work-item a pixel, tile
-            lists in local memory, for GPUs); None takes what suits the device's type.
-
-    >>> vestcl.use("pocl")  # doctest: +SKIP
-    >>> with vestcl.use("nvidia"):  # doctest: +SKIP
-    ...     image, coverage = vestcl.splat(...)
-    """
-
-    def __init__(self, selector: str | None = None, mapping: str | None = None) -> None:
-        if mapping not in (None, "tile", "pixel"):
-            raise ValueError(f"`mapping` must be 'tile', 'pixel' or None, got {mapping!r}")
-        info = select(selector)
-        self.session = open_session(info, mapping or ("tile" if info.kind == "CPU" else "pixel"))
-        self._permanent = False
-        self._before = _use()
-        if self._before is not None and self._before._permanent:
-            self._before._before = None  # which a ``with`` block would go back to
-        _selected.set(self)
-
-    def __enter__(self) -> "Session":
-        self._enter()
-        self._permanent = False
-        _selected.set(self)
-        return self.session
-
-    def _leave(self, *_: object) -> None:
-        _selected.set(self._before)
-
-    def _holds(self) -> bool:
-        """Not where it is for a ``with`` block that an interrupt ended."""
-        if self._exit is None:  # no ``with`` statement enters it
-            self._permanent = True
-        return self._permanent or not self.abandoned
-
-
-def _use() -> use | None:
-    """The last one that holds here."""
-    chosen = _selected.get()
-    while chosen is not None and not chosen._holds():
-        chosen = chosen._before
-    return chosen
-
-
-def current() -> "Session":
-    """The session that operators run on now; opens the default device on first use."""
-    chosen = _use()
-    if chosen is not None:
-        return chosen.session
-    info = select()
-    return open_session(info, "tile" if info.kind == "CPU" else "pixel")
-
-
-@functools.cache
-def open_session(info: DeviceInfo, mapping: str) -> "Session":
-    device = next(device for known, device in _all_devices() if known == info)
-    if "PoCL" in info.version and (fault := icd.linker_fault() or pocl_cache.ensure().fault):
-        raise DeviceError(fault)
-    return Session(info, mapping, device)
-
-
-def free_scratch() -> None:
-    """`Session.free_scratch` of every open device; a process that was forked has none."""
-    for session in () if _forked else tuple(_sessions):
-        session.free_scratch()
-
-
-# ---------------------------------------------------------------- programs
-
-
-@functools.cache
-def kernel_folder() -> Path:
-    """Where the .cl files are: vestcl/kernels in a wheel, kernels/ beside the package in a checkout."""
-    package = Path(__file__).resolve().parent
-    for folder in (package / "kernels", package.parent / "kernels"):
-        if (folder / "common.h").is_file():
-            return folder
-    raise DeviceError(f"vestcl's OpenCL kernels are missing beside {package}: install the package again")
-
-
-@functools.cache
-def source(name: str) -> str:
-    """Kernel file ``name`` with its ``#include "..."`` lines inlined, and #line so that errors point home."""
-    text = (kernel_folder() / name).read_text()
-    parts = [f'#line 1 "{name}"']
-    for number, line in enumerate(text.splitlines(), start=1):
-        included = re.fullmatch(r'\s*#include "(.+)"\s*', line)
-        parts.append(f'{source(included[1])}\n#line {number + 1} "{name}"' if included else line)
-    return "\n".join(parts)
-
-
-# ---------------------------------------------------------------- sessions and jobs
 
 
 class observe(WithBlock):  # noqa: N801 - reads as a verb, as `use` does
@@ -386,6 +150,7 @@ class Session:
         self._profiles: list[_Profile] = []
         self._launched: list[tuple[str, int, cl.Event]] | None = None
         _sessions.add(self)
+        forks.hold(self)
 
     def __repr__(self) -> str:
         return f"Session({self.info.index} {self.info.platform} / {self.info.name}, mapping={self.mapping!r})"
@@ -406,7 +171,7 @@ class Session:
 
     def kernel(self, file: str, name: str, defines: Defines) -> cl.Kernel:
         """Kernel ``name`` of ``file`` built with ``defines``; each program is built once and kept."""
-        _refuse_after_fork()
+        refuse_after_fork()
         key = (file, tuple(sorted(defines.items())))
         if key not in self._kernels:
             program = self._build(file, defines)
@@ -501,13 +266,13 @@ class _Profile(WithBlock):
 
     def __enter__(self) -> list[KernelTime]:
         self._enter()
-        _refuse_after_fork()
+        refuse_after_fork()
         self._session._profiles.append(self)
         return self._times
 
     def _leave(self, *_: object) -> None:
         self._session._profiles.remove(self)
-        for name, event in () if _forked else self.events:
+        for name, event in () if was_forked() else self.events:
             event.wait()
             self._times.append(KernelTime(name, event.profile.start, event.profile.end))
 
@@ -522,7 +287,7 @@ class Job(Holder):
 
     def __enter__(self) -> "Job":
         self._enter()
-        _refuse_after_fork()
+        refuse_after_fork()
         session = self.session
         self._outer = session._enclosing()
         if self._outer is None:
@@ -546,7 +311,7 @@ class Job(Holder):
         try:
             if not failed:
                 self.sync()
-            elif _forked:
+            elif was_forked():
                 return
             else:
                 session._queue.finish()
@@ -618,7 +383,7 @@ class Job(Holder):
 
     def sync(self) -> None:
         """Wait for everything enqueued; afterwards the arrays given to `write` hold their results."""
-        _refuse_after_fork()
+        refuse_after_fork()
         queue = self.session._queue
         maps = []
         for buffer, array in self._outputs:
@@ -631,15 +396,3 @@ class Job(Holder):
         for mapped in maps:  # not before: rusticl aborts where a map has not come about yet
             mapped.base.release(queue)
         self._outputs.clear()
-
-
-def defines_for(dtype: np.dtype, **more: str | int) -> dict[str, str | int]:
-    """What every kernel file is built with: REAL, REAL_BITS, the constants, and ``more``."""
-    double = dtype == np.float64
-    return {
-        "REAL": "double" if double else "float",
-        "REAL_BITS": 64 if double else 32,
-        "NEAR": repr(constants.NEAR),
-        "TILE": constants.TILE,
-        **more,
-    }

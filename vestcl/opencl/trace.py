@@ -22,9 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from vestcl import __version__
+from vestcl import __version__, opencl
 from vestcl.io import atomic
-from vestcl.opencl import session as runtime
 
 #: Nanoseconds after which a device's clock is compared with the host's again: clocks drift by tens of ppm, which is
 #: some ten microseconds then.
@@ -51,7 +50,7 @@ class _Span:
 class _Kernel:
     """A launch with all times on the host's clock, nanoseconds."""
 
-    device: runtime.DeviceInfo
+    device: opencl.DeviceInfo
     name: str
     thread: int
     enqueued: int
@@ -69,7 +68,7 @@ class _Recording:
         self.spans: list[_Span] = []
         self.kernels: list[_Kernel] = []
         self.threads: dict[int, str] = {}
-        self._clocks: dict[runtime.Session, tuple[int, int]] = {}
+        self._clocks: dict[opencl.Session, tuple[int, int]] = {}
 
     def span(self, name: str, category: str, start: int, end: int) -> int:
         """Keep a span of the calling thread; the thread's number."""
@@ -78,7 +77,7 @@ class _Recording:
         self.spans.append(_Span(name, category, thread, start, end))
         return thread
 
-    def job(self, times: runtime.JobTimes) -> None:
+    def job(self, times: opencl.JobTimes) -> None:
         """Keep a job and its kernels."""
         thread = self.span("OpenCL job", "opencl", times.start_ns, times.end_ns)
         ahead = self._ahead(times)
@@ -86,7 +85,7 @@ class _Recording:
             device_times = (t - ahead for t in (one.queued_ns, one.submitted_ns, one.start_ns, one.end_ns))
             self.kernels.append(_Kernel(times.session.info, one.name, thread, one.enqueued_ns, *device_times))
 
-    def _ahead(self, times: runtime.JobTimes) -> int:
+    def _ahead(self, times: opencl.JobTimes) -> int:
         """By how much the device's clock is ahead, nanoseconds: as it was compared, within what the job allows."""
         compared, ahead = self._clocks.get(times.session, (0, 0))
         if not compared or times.end_ns - compared > _CLOCK_AGE:
@@ -98,7 +97,7 @@ class _Recording:
         return min(max(ahead, least), most) if least <= most else ahead
 
 
-class _Record(runtime.observe):
+class _Record(opencl.observe):
     """See `record`."""
 
     def __init__(self, path: str | Path) -> None:
@@ -179,7 +178,7 @@ def _content(recording: _Recording) -> dict[str, Any]:
     return {"traceEvents": events, "displayTimeUnit": "ms", "otherData": about}
 
 
-def _names(recording: _Recording, devices: dict[runtime.DeviceInfo, int]) -> Iterator[Event]:
+def _names(recording: _Recording, devices: dict[opencl.DeviceInfo, int]) -> Iterator[Event]:
     """Metadata: what tracks are called."""
     process = os.getpid()
     yield _meta("process_name", process, process, name="vestcl")
@@ -203,7 +202,7 @@ def _spans(recording: _Recording) -> Iterator[Event]:
         yield {"ph": "X", "cat": one.category, "name": one.name, **place}
 
 
-def _kernels(recording: _Recording, devices: dict[runtime.DeviceInfo, int]) -> Iterator[Event]:
+def _kernels(recording: _Recording, devices: dict[opencl.DeviceInfo, int]) -> Iterator[Event]:
     """Each kernel, and an arrow to it from the job that launched it."""
     ends = dict.fromkeys(devices, 0)
     for number, one in enumerate(sorted(recording.kernels, key=lambda kernel: kernel.start)):

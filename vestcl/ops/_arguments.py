@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch.autograd import forward_ad
 
-from vestcl.opencl import session as runtime
+from vestcl import opencl
 
 Array = TypeVar("Array", torch.Tensor, np.ndarray)
 """A torch tensor or a NumPy array; an operator answers in the kind that it was asked in."""
@@ -182,7 +182,7 @@ class WorkItems(NamedTuple):
     """Local size."""
 
 
-def work_items(session: runtime.Session, count: int) -> WorkItems:
+def work_items(session: opencl.Session, count: int) -> WorkItems:
     """Work-items for ``count`` independent things: a chunk each on a CPU, one each on a GPU.
 
     For kernels whose work-items only walk on to the next result; a sum has its own split, the same on all devices.

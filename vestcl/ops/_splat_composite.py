@@ -6,16 +6,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from vestcl import constants
+from vestcl import constants, opencl
 from vestcl.opencl import host_memory
-from vestcl.opencl import session as runtime
 from vestcl.ops._splat_lists import Array, Geometry, TileLists, chunks_of
 
 #: Channels that a GPU's work-item keeps in registers; more are composited in groups.
 CHANNEL_GROUP: Final = 32
 _GROUP: Final = constants.TILE**2
-_TILES: Final = "splat_composite.cl"
-_PIXELS: Final = "splat_composite_pixels.cl"
+_TILES: Final = "splat/splat_composite.cl"
+_PIXELS: Final = "splat/splat_composite_pixels.cl"
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class Layer:
             stream = builtins and self.channels * itemsize % line == 0
             own |= {"VECTOR": next(widths), "SEGMENT": constants.SEGMENT}
             own |= {"BUILTINS": int(builtins), "STREAM": int(stream)}
-        return runtime.defines_for(self.dtype, **own)
+        return opencl.defines_for(self.dtype, **own)
 
     def backgrounds_or_zero(self) -> Array:
         zero = (self.geometry.batch, self.channels)
@@ -85,7 +84,7 @@ def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
     """Image [B, H, W, C], coverage [B, H, W], and what the forward learnt for the backward, int32.
 
     That is for the mapping "pixel" whether each point's features are finite [P], and for "tile" pack_walked of
-    kernels/splat_walk.h [B * tiles].
+    kernels/splat/splat_walk.h [B * tiles].
     """
     geometry, lists = layer.geometry, layer.lists
     image = host_memory.empty((geometry.batch, geometry.height, geometry.width, layer.channels), layer.dtype)
@@ -149,19 +148,19 @@ def composite_backward(
         *outputs, backgrounds = (job.write(grads[n]) if n in grads and grads[n].size else none for n in shapes)
         per_tile = job.scratch(len(layer.lists.tile_slots) * layer.channels if wanted.backgrounds else 1, layer.dtype)
         if geometry.points:
-            clear: list[runtime.Argument] = [np.int32(geometry.points), layer.lists.places, *outputs]
+            clear: list[opencl.Argument] = [np.int32(geometry.points), layer.lists.places, *outputs]
             chunks = chunks_of(layer.lists.session, geometry.points, 1)
             job.launch(file, "clear_gradients", defines, (chunks,), clear)
         launch(job, layer, defines, learnt, grad_image, grad_coverage, outputs, per_tile)
         if wanted.backgrounds:
-            total: list[runtime.Argument] = [np.int32(geometry.tiles), per_tile, backgrounds]
+            total: list[opencl.Argument] = [np.int32(geometry.tiles), per_tile, backgrounds]
             job.launch(file, "sum_grad_backgrounds", defines, (layer.channels, geometry.batch), total)
     return grads
 
 
 def _launch_tiles_backward(
-    job: runtime.Job, layer: Layer, defines: dict[str, str | int], learnt: Array, grad_image: Array,
-    grad_coverage: Array | None, outputs: list[runtime.Buffer], per_tile: runtime.Buffer,
+    job: opencl.Job, layer: Layer, defines: dict[str, str | int], learnt: Array, grad_image: Array,
+    grad_coverage: Array | None, outputs: list[opencl.Buffer], per_tile: opencl.Buffer,
 ) -> None:  # fmt: skip
     lists = layer.lists
     strides, grad_image = _strides(grad_image)
@@ -183,8 +182,8 @@ def _launch_tiles_backward(
 
 
 def _launch_pixels_backward(
-    job: runtime.Job, layer: Layer, defines: dict[str, str | int], learnt: Array, grad_image: Array,
-    grad_coverage: Array | None, outputs: list[runtime.Buffer], per_tile: runtime.Buffer,
+    job: opencl.Job, layer: Layer, defines: dict[str, str | int], learnt: Array, grad_image: Array,
+    grad_coverage: Array | None, outputs: list[opencl.Buffer], per_tile: opencl.Buffer,
 ) -> None:  # fmt: skip
     geometry, lists = layer.geometry, layer.lists
     strides, grad_image = _strides(grad_image)
@@ -223,7 +222,7 @@ def _phases(layer: Layer) -> Iterator[tuple[list[np.int32], tuple[int, int, int]
             yield [np.int32(n) for n in (x, y, step_x, step_y)], grid
 
 
-def _read(job: runtime.Job, array: Array | None) -> runtime.Buffer:
+def _read(job: opencl.Job, array: Array | None) -> opencl.Buffer:
     """A kernel argument, even where there is nothing that the kernel would read."""
     return job.read(array) if array is not None and array.size else job.scratch(1, np.float64)
 

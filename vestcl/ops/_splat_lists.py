@@ -1,12 +1,11 @@
-"""Rasterisation: points sorted into depth-ordered tile lists on the device (kernels/splat_bin.cl)."""
+"""Rasterisation: points sorted into depth-ordered tile lists on the device (kernels/splat/splat_bin.cl)."""
 
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from vestcl import constants
-from vestcl.opencl import session as runtime
+from vestcl import constants, opencl
 
 Array = np.ndarray[Any, Any]
 
@@ -62,28 +61,28 @@ class Geometry:
 class TileLists:
     """Depth-sorted lists of every tile, on the device. E entries, one for each (point, tile) with a fragment."""
 
-    session: runtime.Session
+    session: opencl.Session
     tile_starts: Array
     """[B * tiles + 1] int32."""
     tile_slots: Array
     """[B * tiles] int64: room that the backward needs, in pixels of all footprints inside the tile."""
     steps: tuple[int, int]
     """Rows and columns of tiles from one tile to the next that certainly share no point."""
-    records: runtime.Buffer
-    """[E] record_t of kernels/splat.h."""
-    places: runtime.Buffer
-    """[P] int32: the tiles of each point, see pack_place in kernels/splat.h."""
-    slot_starts: runtime.Buffer
+    records: opencl.Buffer
+    """[E] record_t of kernels/splat/splat.h."""
+    places: opencl.Buffer
+    """[P] int32: the tiles of each point, see pack_place in kernels/splat/splat.h."""
+    slot_starts: opencl.Buffer
     """[E] int64: an entry's first slot in its tile; only the mapping "pixel" has it."""
 
 
-def chunks_of(session: runtime.Session, points: int, counters: int) -> int:
+def chunks_of(session: opencl.Session, points: int, counters: int) -> int:
     """Work-items that share ``points``, each with ``counters`` numbers of its own. No result depends on it."""
     wanted = CHUNKS_PER_UNIT * session.info.compute_units if session.mapping == "tile" else points // GPU_CHUNK
     return max(1, min(wanted, MAX_COUNTERS // counters))
 
 
-def list_tiles(session: runtime.Session, geometry: Geometry) -> TileLists:
+def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
     """Count each chunk's points per tile, list them by tile in order of their index, sort each list by depth."""
     defines = _defines(session, geometry)
     tile_counts = np.zeros(geometry.batch * geometry.tiles, np.int32)
@@ -100,25 +99,25 @@ def list_tiles(session: runtime.Session, geometry: Geometry) -> TileLists:
         transparent = np.int32(geometry.list_transparent)
         counts = job.scratch(geometry.batch * chunks * geometry.tiles, np.int32)
         job.launch(
-            "splat_bin.cl", "count_tiles", defines, (chunks, geometry.batch),
+            "splat/splat_bin.cl", "count_tiles", defines, (chunks, geometry.batch),
             [*geometry.sizes, starts, points_uv, z, radii, opacities, transparent, places, counts, job.write(spans)],
         )  # fmt: skip
         job.launch(
-            "splat_bin.cl", "scan_chunks", defines, (geometry.tiles, geometry.batch),
+            "splat/splat_bin.cl", "scan_chunks", defines, (geometry.tiles, geometry.batch),
             [np.int32(chunks), np.int32(geometry.tiles), counts, job.write(tile_counts)],
         )  # fmt: skip
         job.sync()
         tile_starts = _starts(tile_counts)
         entries = job.scratch(int(tile_starts[-1]), _entry_type(geometry))
         job.launch(
-            "splat_bin.cl", "fill_tiles", defines, (chunks, geometry.batch),
+            "splat/splat_bin.cl", "fill_tiles", defines, (chunks, geometry.batch),
             [*geometry.sizes, starts, points_uv, z, radii, places, job.read(tile_starts), counts, entries],
         )  # fmt: skip
         return _sort(job, geometry, tile_starts, int(spans.max()), places, entries)
 
 
-def _defines(session: runtime.Session, geometry: Geometry) -> dict[str, str | int]:
-    return runtime.defines_for(geometry.z.dtype, BUILTINS=int(session.compiles_builtins))
+def _defines(session: opencl.Session, geometry: Geometry) -> dict[str, str | int]:
+    return opencl.defines_for(geometry.z.dtype, BUILTINS=int(session.compiles_builtins))
 
 
 def _starts(tile_counts: Array) -> Array:
@@ -134,12 +133,12 @@ def _entry_type(geometry: Geometry) -> np.dtype[Any]:
 
 
 def _sort(
-    job: runtime.Job,
+    job: opencl.Job,
     geometry: Geometry,
     tile_starts: Array,
     span: int,
-    places: runtime.Buffer,
-    entries: runtime.Buffer | None,
+    places: opencl.Buffer,
+    entries: opencl.Buffer | None,
 ) -> TileLists:
     """Sort every tile's entries by (z, index) into records. Without points there is nothing to sort."""
     count, tiles = int(tile_starts[-1]), len(tile_starts) - 1
@@ -152,15 +151,15 @@ def _sort(
     if entries is not None and count:
         arrays = (tile_starts, geometry.points_uv, geometry.radii, geometry.opacities)
         room = job.scratch(count, _entry_type(geometry))
-        arguments: list[runtime.Argument] = [*geometry.sizes, *map(np.int32, steps), *map(job.read, arrays)]
+        arguments: list[opencl.Argument] = [*geometry.sizes, *map(np.int32, steps), *map(job.read, arrays)]
         arguments += [entries, room, records, job.write(tile_slots)]
         defines = _defines(job.session, geometry)
         if together:
             group = constants.TILE**2
             job.launch(
-                "splat_bin.cl", "sort_tiles_together", defines | {"TOGETHER": 1}, (tiles * group,),
+                "splat/splat_bin.cl", "sort_tiles_together", defines | {"TOGETHER": 1}, (tiles * group,),
                 [*arguments, slot_starts], (group,),
             )  # fmt: skip
         else:
-            job.launch("splat_bin.cl", "sort_tiles", defines, (tiles,), arguments)
+            job.launch("splat/splat_bin.cl", "sort_tiles", defines, (tiles,), arguments)
     return TileLists(job.session, tile_starts, tile_slots, steps, records, places, slot_starts)

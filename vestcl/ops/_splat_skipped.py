@@ -1,11 +1,11 @@
-"""What splatting skips, counted on demand (kernels/splat_skipped.cl)."""
+"""What splatting skips, counted on demand (kernels/splat/splat_skipped.cl)."""
 
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from vestcl.opencl import session as runtime
+from vestcl import opencl
 from vestcl.ops._splat_lists import Geometry, TileLists, chunks_of
 
 #: Why a point is in no list, in the order in which the kernel asks and counts.
@@ -50,10 +50,10 @@ def count_culled(geometry: Geometry, lists: TileLists) -> dict[str, int]:
     counts = np.zeros((chunks_of(lists.session, geometry.points, len(REASONS)), len(REASONS)), np.int32)
     sizes = [np.int32(n) for n in (geometry.height, geometry.width, geometry.points)]
     arrays = (geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
-    defines = runtime.defines_for(geometry.z.dtype)
+    defines = opencl.defines_for(geometry.z.dtype)
     with lists.session.job() as job:
         job.launch(
-            "splat_skipped.cl", "count_skipped", defines, (len(counts),),
+            "splat/splat_skipped.cl", "count_skipped", defines, (len(counts),),
             [*sizes, *map(job.read, arrays), lists.places, job.write(counts)],
         )  # fmt: skip
     return {reason: int(count) for reason, count in zip(REASONS, counts.sum(axis=0), strict=True)}

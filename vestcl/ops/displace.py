@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from vestcl.opencl import session as runtime
+from vestcl import opencl
 from vestcl.ops._arguments import Array, as_array, check, require_no_grad, require_ordinary, work_items
 from vestcl.ops._autograd import differentiable_by, untraced
 
@@ -45,7 +45,7 @@ def displace(
     )
     projection = _projection(as_array(K), None if tgt_from_src is None else as_array(tgt_from_src))
     if not isinstance(points_xyz, torch.Tensor):
-        return _forward(runtime.current(), as_array(points_xyz), as_array(displacement_xyz), projection)
+        return _forward(opencl.current(), as_array(points_xyz), as_array(displacement_xyz), projection)
     require_no_grad("K", K)
     require_no_grad("tgt_from_src", tgt_from_src)
     return _Displace.apply(points_xyz, displacement_xyz, projection)
@@ -56,7 +56,7 @@ class _Displace(torch.autograd.Function):
     def forward(
         ctx: Any, points_xyz: torch.Tensor, displacement_xyz: torch.Tensor, projection: np.ndarray
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        ctx.session, ctx.projection = runtime.current(), projection
+        ctx.session, ctx.projection = opencl.current(), projection
         ctx.save_for_backward(points_xyz, displacement_xyz)
         points_uv, z = _forward(ctx.session, as_array(points_xyz), as_array(displacement_xyz), projection)
         return torch.from_numpy(points_uv), torch.from_numpy(z)
@@ -93,7 +93,7 @@ def _projection(K: np.ndarray, tgt_from_src: np.ndarray | None) -> np.ndarray:
 
 
 def _forward(
-    session: runtime.Session, points_xyz: np.ndarray, displacement_xyz: np.ndarray, projection: np.ndarray
+    session: opencl.Session, points_xyz: np.ndarray, displacement_xyz: np.ndarray, projection: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     batch, count, _ = points_xyz.shape
     points_uv = np.empty((batch, count, 2), points_xyz.dtype)
@@ -102,14 +102,14 @@ def _forward(
         chunk, items, group = work_items(session, count)
         with session.job() as job:
             inputs = [job.read(array) for array in (points_xyz, displacement_xyz, projection)]
-            arguments: list[runtime.Argument] = [np.int32(count), chunk, *inputs, job.write(points_uv), job.write(z)]
-            defines = runtime.defines_for(z.dtype)
+            arguments: list[opencl.Argument] = [np.int32(count), chunk, *inputs, job.write(points_uv), job.write(z)]
+            defines = opencl.defines_for(z.dtype)
             job.launch("displace.cl", "displace", defines, (items, batch), arguments, (group, 1))
     return points_uv, z
 
 
 def _backward(
-    session: runtime.Session,
+    session: opencl.Session,
     points_xyz: np.ndarray,
     displacement_xyz: np.ndarray,
     projection: np.ndarray,
@@ -124,7 +124,7 @@ def _backward(
         with session.job() as job:
             arrays = points_xyz, displacement_xyz, projection, grad_points_uv, grad_z
             inputs = [job.read(array) for array in arrays]
-            arguments: list[runtime.Argument] = [np.int32(count), chunk, *inputs, job.write(grad_xyz)]
-            defines = runtime.defines_for(grad_xyz.dtype)
+            arguments: list[opencl.Argument] = [np.int32(count), chunk, *inputs, job.write(grad_xyz)]
+            defines = opencl.defines_for(grad_xyz.dtype)
             job.launch("displace.cl", "displace_backward", defines, (items, batch), arguments, (group, 1))
     return grad_xyz

@@ -5,8 +5,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from vestcl import constants, geometry
-from vestcl.opencl import session as runtime
+from vestcl import constants, geometry, opencl
 from vestcl.ops._arguments import Array, as_array, check, require_ordinary, work_items
 from vestcl.ops._autograd import Gradients, differentiable_by, untraced
 
@@ -38,7 +37,7 @@ def rigid_flow(points_xyz: Array, quaternion: Array, translation: Array) -> Arra
     """
     check(points_xyz=(points_xyz, "B N 3"), quaternion=(quaternion, "B 4"), translation=(translation, "B 3"))
     if not isinstance(points_xyz, torch.Tensor):
-        return _forward(runtime.current(), as_array(points_xyz), as_array(quaternion), as_array(translation))
+        return _forward(opencl.current(), as_array(points_xyz), as_array(quaternion), as_array(translation))
     return _RigidFlow.apply(points_xyz, quaternion, translation)
 
 
@@ -47,7 +46,7 @@ class _RigidFlow(torch.autograd.Function):
     def forward(
         ctx: Any, points_xyz: torch.Tensor, quaternion: torch.Tensor, translation: torch.Tensor
     ) -> torch.Tensor:
-        ctx.session = runtime.current()
+        ctx.session = opencl.current()
         ctx.save_for_backward(points_xyz, quaternion)
         arrays = as_array(points_xyz), as_array(quaternion), as_array(translation)
         return torch.from_numpy(_forward(ctx.session, *arrays))
@@ -72,11 +71,11 @@ def _formula(points_xyz: torch.Tensor, quaternion: torch.Tensor, translation: to
 
 
 def _defines(dtype: np.dtype) -> dict[str, str | int]:
-    return runtime.defines_for(dtype, CHUNKS=CHUNKS, QUATERNION_FLOOR=repr(constants.QUATERNION_FLOOR))
+    return opencl.defines_for(dtype, CHUNKS=CHUNKS, QUATERNION_FLOOR=repr(constants.QUATERNION_FLOOR))
 
 
 def _forward(
-    session: runtime.Session, points_xyz: np.ndarray, quaternion: np.ndarray, translation: np.ndarray
+    session: opencl.Session, points_xyz: np.ndarray, quaternion: np.ndarray, translation: np.ndarray
 ) -> np.ndarray:
     batch, count, _ = points_xyz.shape
     displacement_xyz = np.empty_like(points_xyz)
@@ -84,14 +83,14 @@ def _forward(
         chunk, items, group = work_items(session, count)
         with session.job() as job:
             inputs = [job.read(array) for array in (points_xyz, quaternion, translation)]
-            arguments: list[runtime.Argument] = [np.int32(count), chunk, *inputs, job.write(displacement_xyz)]
+            arguments: list[opencl.Argument] = [np.int32(count), chunk, *inputs, job.write(displacement_xyz)]
             defines = _defines(points_xyz.dtype)
             job.launch("rigid_flow.cl", "rigid_flow", defines, (items, batch), arguments, (group, 1))
     return displacement_xyz
 
 
 def _backward(
-    session: runtime.Session,
+    session: opencl.Session,
     points_xyz: np.ndarray,
     quaternion: np.ndarray,
     grad_displacement_xyz: np.ndarray,
@@ -112,7 +111,7 @@ def _backward(
 
 
 def _backward_points(
-    session: runtime.Session, points_xyz: np.ndarray, quaternion: np.ndarray, grad_displacement_xyz: np.ndarray
+    session: opencl.Session, points_xyz: np.ndarray, quaternion: np.ndarray, grad_displacement_xyz: np.ndarray
 ) -> np.ndarray:
     batch, count, _ = points_xyz.shape
     grad_points_xyz = np.empty_like(points_xyz)
@@ -120,14 +119,14 @@ def _backward_points(
         chunk, items, group = work_items(session, count)
         with session.job() as job:
             inputs = [job.read(array) for array in (points_xyz, quaternion, grad_displacement_xyz)]
-            arguments: list[runtime.Argument] = [np.int32(count), chunk, *inputs, job.write(grad_points_xyz)]
+            arguments: list[opencl.Argument] = [np.int32(count), chunk, *inputs, job.write(grad_points_xyz)]
             defines = _defines(points_xyz.dtype)
             job.launch("rigid_flow.cl", "rigid_flow_backward_points", defines, (items, batch), arguments, (group, 1))
     return grad_points_xyz
 
 
 def _backward_motion(
-    session: runtime.Session, points_xyz: np.ndarray, quaternion: np.ndarray, grad_displacement_xyz: np.ndarray
+    session: opencl.Session, points_xyz: np.ndarray, quaternion: np.ndarray, grad_displacement_xyz: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradients of quaternion [B, 4] and translation [B, 3]: sums over the points, in an order that never changes."""
     batch, count, _ = points_xyz.shape
@@ -138,7 +137,7 @@ def _backward_motion(
         with session.job() as job:
             partial_sums = job.scratch(batch * CHUNKS * 3 * 4, points_xyz.dtype)
             inputs = [job.read(points_xyz), job.read(grad_displacement_xyz)]
-            arguments: list[runtime.Argument] = [np.int32(count), *inputs, partial_sums]
+            arguments: list[opencl.Argument] = [np.int32(count), *inputs, partial_sums]
             job.launch("rigid_flow.cl", "rigid_flow_backward_sums", defines, (CHUNKS, batch), arguments)
             outputs = [job.write(grad_quaternion), job.write(grad_translation)]
             arguments = [job.read(quaternion), partial_sums, *outputs]

@@ -6,8 +6,7 @@ from typing import Any, Generic, NoReturn
 import numpy as np
 import torch
 
-from vestcl import constants
-from vestcl.opencl import session as runtime
+from vestcl import constants, opencl
 from vestcl.ops._arguments import Array, as_array, check, check_starts, require_no_grad, require_ordinary
 from vestcl.ops._autograd import Gradients, differentiable_once, untraced
 from vestcl.ops._splat_composite import Layer, Wanted, composite_backward, composite_forward
@@ -106,7 +105,7 @@ def splat(
 
     Source: SPEC section 2; the footprint is 3D Moments' (CVPR 2022), without its limit on fragments per pixel.
     """
-    with runtime.current().job():
+    with opencl.current().job():
         raster = rasterize(points_uv, z, radii, opacities, height, width, cloud_starts=cloud_starts)
         return composite(raster, features, backgrounds, min_transmittance)
 
@@ -156,7 +155,7 @@ def rasterize(
         width=_size("width", width),
         list_transparent=_requires_grad(opacities),
     )
-    lists = list_tiles(runtime.current(), geometry)
+    lists = list_tiles(opencl.current(), geometry)
     grad_fns = tuple(_grad_fn(array) for array in (points_uv, radii, opacities))
     return Raster(points_uv, radii, opacities, cloud_starts is not None, geometry, lists, grad_fns)
 

@@ -3,8 +3,7 @@
 import numpy as np
 import torch
 
-from vestcl import constants
-from vestcl.opencl import session as runtime
+from vestcl import constants, opencl
 from vestcl.ops._arguments import Array, as_array, check, work_items
 from vestcl.ops._autograd import untraced
 
@@ -39,21 +38,21 @@ def stretch(points_uv: Array, magnified: Array) -> tuple[Array, Array]:
     footprint's general form.
     """
     check(points_uv=(points_uv, "B H W 2"), magnified=(magnified, "B H W"))
-    factor, opacity = _stretch(runtime.current(), as_array(points_uv), as_array(magnified))
+    factor, opacity = _stretch(opencl.current(), as_array(points_uv), as_array(magnified))
     if isinstance(points_uv, torch.Tensor):
         return torch.from_numpy(factor), torch.from_numpy(opacity)
     return factor, opacity
 
 
-def _stretch(session: runtime.Session, points_uv: np.ndarray, magnified: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _stretch(session: opencl.Session, points_uv: np.ndarray, magnified: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     batch, height, width = magnified.shape
     factor, opacity = np.empty_like(magnified), np.empty_like(magnified)
     if magnified.size:
         chunk, items, group = work_items(session, width)
-        sizes: list[runtime.Argument] = [np.int32(height), np.int32(width), chunk]
+        sizes: list[opencl.Argument] = [np.int32(height), np.int32(width), chunk]
         with session.job() as job:
             arguments = [*sizes, job.read(points_uv), job.read(magnified), job.write(factor), job.write(opacity)]
             limits = {name: str(getattr(constants, name)) for name in ("TORN", "SLANTED", "BENT")}
-            defines = runtime.defines_for(magnified.dtype, **limits)
+            defines = opencl.defines_for(magnified.dtype, **limits)
             job.launch("stretch.cl", "stretch", defines, (items, height, batch), arguments, (group, 1, 1))
     return factor, opacity

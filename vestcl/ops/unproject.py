@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from vestcl.opencl import session as runtime
+from vestcl import opencl
 from vestcl.ops._arguments import Array, as_array, check, require_no_grad, require_ordinary, work_items
 from vestcl.ops._autograd import untraced
 
@@ -30,14 +30,14 @@ def unproject(depth: Array, K: Array) -> Array:
     """
     check(depth=(depth, "B 1 H W"), K=(K, "B 3 3"))
     if not isinstance(depth, torch.Tensor):
-        return _forward(runtime.current(), as_array(depth), _inverse(as_array(K)))
+        return _forward(opencl.current(), as_array(depth), _inverse(as_array(K)))
     require_no_grad("K", K)
-    return _Unproject.apply(depth, runtime.current(), _inverse(as_array(K)))
+    return _Unproject.apply(depth, opencl.current(), _inverse(as_array(K)))
 
 
 class _Unproject(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, depth: torch.Tensor, session: runtime.Session, inverse_K: np.ndarray) -> torch.Tensor:
+    def forward(ctx: Any, depth: torch.Tensor, session: opencl.Session, inverse_K: np.ndarray) -> torch.Tensor:
         ctx.session, ctx.shape, ctx.inverse_K = session, depth.shape, inverse_K
         return torch.from_numpy(_forward(session, as_array(depth), inverse_K))
 
@@ -53,7 +53,7 @@ class _UnprojectBackward(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, grad_points_xyz: torch.Tensor, session: runtime.Session, shape: torch.Size, inverse_K: np.ndarray
+        ctx: Any, grad_points_xyz: torch.Tensor, session: opencl.Session, shape: torch.Size, inverse_K: np.ndarray
     ) -> torch.Tensor:
         ctx.session, ctx.inverse_K = session, inverse_K
         return torch.from_numpy(_backward(session, shape, inverse_K, as_array(grad_points_xyz)))
@@ -73,29 +73,29 @@ def _inverse(K: np.ndarray) -> np.ndarray:
         raise ValueError("`K` must be invertible, got a singular matrix") from None
 
 
-def _forward(session: runtime.Session, depth: np.ndarray, inverse_K: np.ndarray) -> np.ndarray:
+def _forward(session: opencl.Session, depth: np.ndarray, inverse_K: np.ndarray) -> np.ndarray:
     batch, _, height, width = depth.shape
     points_xyz = np.empty((batch, height * width, 3), depth.dtype)
     if points_xyz.size:
         chunk, items, group = work_items(session, width)
-        sizes: list[runtime.Argument] = [np.int32(height), np.int32(width), chunk]
+        sizes: list[opencl.Argument] = [np.int32(height), np.int32(width), chunk]
         with session.job() as job:
             arguments = [*sizes, job.read(depth), job.read(inverse_K), job.write(points_xyz)]
-            defines = runtime.defines_for(depth.dtype)
+            defines = opencl.defines_for(depth.dtype)
             job.launch("unproject.cl", "unproject", defines, (items, height, batch), arguments, (group, 1, 1))
     return points_xyz
 
 
 def _backward(
-    session: runtime.Session, shape: torch.Size, inverse_K: np.ndarray, grad_points_xyz: np.ndarray
+    session: opencl.Session, shape: torch.Size, inverse_K: np.ndarray, grad_points_xyz: np.ndarray
 ) -> np.ndarray:
     batch, _, height, width = shape
     grad_depth = np.empty(shape, grad_points_xyz.dtype)
     if grad_depth.size:
         chunk, items, group = work_items(session, width)
-        sizes: list[runtime.Argument] = [np.int32(height), np.int32(width), chunk]
+        sizes: list[opencl.Argument] = [np.int32(height), np.int32(width), chunk]
         with session.job() as job:
             arguments = [*sizes, job.read(inverse_K), job.read(grad_points_xyz), job.write(grad_depth)]
-            defines = runtime.defines_for(grad_depth.dtype)
+            defines = opencl.defines_for(grad_depth.dtype)
             job.launch("unproject.cl", "unproject_backward", defines, (items, height, batch), arguments, (group, 1, 1))
     return grad_depth

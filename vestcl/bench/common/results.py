@@ -17,11 +17,10 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from vestcl import __version__, doctor
+from vestcl import __version__, doctor, opencl
 from vestcl.bench.common.timing import Spread
 from vestcl.evaluation.tables import Grid, finite, to_markdown, to_rich
 from vestcl.io import atomic
-from vestcl.opencl import session as runtime
 
 #: The selector that means every device that works.
 ALL: Final = "all"
@@ -80,28 +79,26 @@ class Results:
 # ---------------------------------------------------------------- devices
 
 
-def each_device(selector: str | None, console: Console | None = None) -> Generator[runtime.Session, None, None]:
+def each_device(selector: str | None, console: Console | None = None) -> Generator[opencl.Session, None, None]:
     """Sessions to measure on, one after the other; each is vestcl's current one until the next is asked for.
 
     Args:
-        selector: as in `runtime.select`; or "all": every device that passes `vestcl doctor`, each tried in a process of
+        selector: as in `opencl.select`; or "all": every device that passes `vestcl doctor`, each tried in a process of
             its own first, because a driver may kill the one that loads it.
         console: where devices that don't work are reported; None is the error output.
 
     Yields:
-        The session, inside `runtime.use`.
+        The session, inside `opencl.use`.
 
     Raises:
         DeviceError: no such device, or with "all" none that works.
     """
     for index in _usable(console or Console(stderr=True)) if selector == ALL else [selector]:
-        with runtime.use(index) as session:
+        with opencl.use(index) as session:
             yield session
 
 
-def measure_each(
-    selector: str | None, measure: Callable[[runtime.Session], Results], console: Console
-) -> list[Results]:
+def measure_each(selector: str | None, measure: Callable[[opencl.Session], Results], console: Console) -> list[Results]:
     """``measure`` on `each_device`. With "all", a device that fails is reported and the others go on.
 
     Args:
@@ -119,12 +116,12 @@ def measure_each(
         found = [_tried(session, measure, console, selector == ALL) for session in sessions]
     results = [result for result in found if result is not None]
     if not results:
-        raise runtime.DeviceError("the benchmark failed on every device")
+        raise opencl.DeviceError("the benchmark failed on every device")
     return results
 
 
 def _tried(
-    session: runtime.Session, measure: Callable[[runtime.Session], Results], console: Console, others_go_on: bool
+    session: opencl.Session, measure: Callable[[opencl.Session], Results], console: Console, others_go_on: bool
 ) -> Results | None:
     try:
         return measure(session)
@@ -143,11 +140,11 @@ def _usable(console: Console) -> list[str]:
             _report(console, device.info, next(iter(device.notes), "does not work"))
     works = [device.info.index for device in report.devices if device.works]
     if not works:
-        raise runtime.DeviceError("no OpenCL device works: `vestcl doctor` tells why")
+        raise opencl.DeviceError("no OpenCL device works: `vestcl doctor` tells why")
     return works
 
 
-def _report(console: Console, info: runtime.DeviceInfo, reason: str) -> None:
+def _report(console: Console, info: opencl.DeviceInfo, reason: str) -> None:
     console.print(Text(f"{info.index} {info.platform} / {info.name} left out: {reason}", "red"), soft_wrap=True)
 
 
@@ -166,7 +163,7 @@ def write_json(path: Path, results: dict[str, Any]) -> None:
     atomic.write_bytes(path, (json.dumps(results, indent=1) + "\n").encode())
 
 
-def describe(session: runtime.Session) -> dict[str, str]:
+def describe(session: opencl.Session) -> dict[str, str]:
     """What the numbers depend on: versions, device, processor, date."""
     versions = {}
     for package in _PACKAGES:

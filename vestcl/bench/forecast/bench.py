@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from rich.console import Console
 
+from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.forecast import tables
 from vestcl.bench.forecast.config import HELD_OUT, ForecastBench, check
@@ -20,7 +21,6 @@ from vestcl.forecasting import peer
 from vestcl.io.atomic import write_bytes
 from vestcl.models.inference import quality
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
-from vestcl.opencl import session as runtime
 
 __all__ = ["HELD_OUT", "ForecastBench", "main"]
 
@@ -37,7 +37,7 @@ def main(config: ForecastBench) -> None:
     """
     check(config)
     console = _results.console(WIDTH)
-    with runtime.use(config.device) as session:
+    with opencl.use(config.device) as session:
         machine = _results.describe(session)
         networks = _networks(config)
         groups, kept = groups_of(config), kept_windows(config)

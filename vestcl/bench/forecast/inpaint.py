@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from vestcl import opencl
 from vestcl.bench.common.results import describe, write_json
 from vestcl.bench.forecast import open_pixels
 from vestcl.constants import SKY_DEPTH
@@ -24,7 +25,6 @@ from vestcl.data.street.raycast import SKY_DEPTH as STREET_SKY
 from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.st_lpips import Option as StLpipsOption
 from vestcl.io.labels import background
-from vestcl.opencl import session as runtime
 from vestcl.scene.inpainting.inpaint import DEFAULT, inpaint_background
 from vestcl.scene.inpainting.inpainters import METHODS
 
@@ -74,8 +74,8 @@ class InpaintBench:
 def main(config: InpaintBench) -> None:
     """Measure and print the table."""
     console = Console()
-    with runtime.use(config.device):
-        about = describe(runtime.current())
+    with opencl.use(config.device):
+        about = describe(opencl.current())
         if config.clips:
             _measure_clips(config, about, console)
             return

@@ -72,7 +72,7 @@ def key_of(settings: Mapping[str, Any]) -> str:
     """Sixteen hexadecimal digits that change with ``settings`` and with the package's source."""
     digest = hashlib.sha256(json.dumps(dict(settings), sort_keys=True, default=str).encode())
     root = Path(vestcl.__file__).parent
-    for file in sorted([*root.rglob("*.py"), *root.rglob("*.cl"), *root.parent.glob("kernels/*.cl")]):
+    for file in sorted([*root.rglob("*.py"), *root.rglob("*.cl"), *root.parent.glob("kernels/**/*.cl")]):
         digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import nn
 
+from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.timing import Spread
@@ -26,7 +27,6 @@ from vestcl.io.labels import background
 from vestcl.models import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster, Step
 from vestcl.models.steps.prior import MotionPrior, nothing_moves
-from vestcl.opencl import session as runtime
 from vestcl.scene import layers
 from vestcl.scene.layers import LayerBatch
 
@@ -157,7 +157,7 @@ def main(config: NetworkBench) -> None:
     _results.check_positive(config, "height", "width", "runs", "threads", "batch")
     model_config = configuration(config.model)
     console = _results.console()
-    with runtime.use(config.device) as session, _timing.torch_threads(config.threads):
+    with opencl.use(config.device) as session, _timing.torch_threads(config.threads):
         machine = _results.describe(session)
         for name, value in machine.items():
             console.print(f"{name}: {value}", soft_wrap=True, highlight=False)
@@ -238,7 +238,7 @@ def train_once(
 ) -> float:
     """One step down the L1 loss; the loss."""
     adam.zero_grad(set_to_none=True)
-    session, busy = runtime.current(), runtime.current().seconds
+    session, busy = opencl.current(), opencl.current().seconds
     with model.watch.time("all of forward"):
         loss = nn.functional.l1_loss(model(*pair, K, prior=prior_of(model, pair[1])).views[0].image, truth)
     with model.watch.time("backward"):

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from vestcl import opencl
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.timing import Spread
 from vestcl.bench.network.backward import BackwardWatch
@@ -20,7 +21,6 @@ from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.stage_times import watching, with_rest
 from vestcl.models.networks.layers import joined
 from vestcl.models.steps.prior import MotionPrior
-from vestcl.opencl import session as runtime
 from vestcl.opencl import trace
 from vestcl.scene.layers import LayerBatch
 
@@ -113,7 +113,7 @@ class Trainer:
 
     def step(self) -> None:
         """Forward, L1, backward, Adam."""
-        session, busy = runtime.current(), runtime.current().seconds
+        session, busy = opencl.current(), opencl.current().seconds
         start = time.perf_counter()
         with trace.stage(FORWARD), watching(self._backward.seen) as watch:
             loss = self.loss()
@@ -125,9 +125,9 @@ class Trainer:
             self._adam.step()
         parts = {FORWARD: forward - start, BACKWARD: end - forward, ADAM: time.perf_counter() - end}
         stages = with_rest(watch.seconds, parts[FORWARD])
-        opencl = {"": session.seconds - busy}
+        device = {"": session.seconds - busy}
         back = with_rest(backward, parts[BACKWARD])
-        self.runs.append({"parts": parts, FORWARD: stages, BACKWARD: back, "opencl": opencl})
+        self.runs.append({"parts": parts, FORWARD: stages, BACKWARD: back, "opencl": device})
 
     def loss(self) -> torch.Tensor:
         """Mean |image - truth|, with all gradients cleared."""

@@ -10,6 +10,7 @@ import torch
 from rich.console import Console
 from torch import nn
 
+from vestcl import opencl
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
@@ -22,7 +23,6 @@ from vestcl.bench.pipeline.traffic import LEAST_FRAMES, TRAFFIC, drive
 from vestcl.evaluation.tables import Grid
 from vestcl.models import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster
-from vestcl.opencl import session as runtime
 from vestcl.opencl import trace
 
 #: Deviation of the last layers' weights of object motion, metres: as it is made it changes nothing, and would not run
@@ -82,7 +82,7 @@ def main(config: TrainStepBench) -> None:
 
 
 def _measure_device(
-    config: TrainStepBench, model_config: ModelConfig, console: Console, session: runtime.Session
+    config: TrainStepBench, model_config: ModelConfig, console: Console, session: opencl.Session
 ) -> Results:
     """Everything on one device."""
     machine = _results.describe(session)

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.results import Results
@@ -21,7 +22,6 @@ from vestcl.bench.pareto.scenes import scene
 from vestcl.cli.progress import Bar
 from vestcl.models.inference import pretrained, quality
 from vestcl.models.inference.fast import accelerate
-from vestcl.opencl import session as runtime
 
 #: Horizons that the two ways of going on from t + 1 are compared at.
 HORIZONS: Final = (1, 3, 5)
@@ -99,7 +99,7 @@ def main(config: ParetoBench) -> None:
             console.print(str(path), soft_wrap=True, highlight=False)
 
 
-def _measure_device(config: ParetoBench, tell: Tell, session: runtime.Session) -> Results:
+def _measure_device(config: ParetoBench, tell: Tell, session: opencl.Session) -> Results:
     steps = max(HORIZONS) if config.recursion else 1
     model = pretrained.load_model(config.model)
     scenes = []

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vestcl import constants
-from vestcl.opencl import session as runtime
+from vestcl import constants, opencl
 
 
 @contextmanager
@@ -72,7 +71,7 @@ def main(arguments: Sequence[str]) -> None:
 
     with np.load(path) as file:
         exact, *arrays = (file[name] for name in ("exact", "points_uv", "z", "radii", "opacities", "features"))
-    with runtime.use(*device):
+    with opencl.use(*device):
         difference = splat(*arrays, *exact.shape[2:])[0] - exact
         print(np.sqrt((difference**2).mean() / (exact**2).mean()), flush=True)
         for _ in sys.stdin:

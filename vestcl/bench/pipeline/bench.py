@@ -8,6 +8,7 @@ from typing import Final, Literal
 import torch
 from rich.console import Console
 
+from vestcl import opencl
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
@@ -20,7 +21,6 @@ from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import pretrained, quality
 from vestcl.models.inference.fast import accelerate
 from vestcl.models.networks import voxel_flow
-from vestcl.opencl import session as runtime
 from vestcl.opencl import trace
 
 #: Of a street whose traffic is ordinary, and that no network was trained on.
@@ -108,7 +108,7 @@ def _check(config: PipelineBench) -> None:
         raise ValueError("`scenes` must be one or more, got none")
 
 
-def _measure_device(config: PipelineBench, model: Forecaster, console: Console, session: runtime.Session) -> Results:
+def _measure_device(config: PipelineBench, model: Forecaster, console: Console, session: opencl.Session) -> Results:
     """All scenes on one device, printed as they come."""
     machine = _results.describe(session)
     _results.show_machine(machine, console)

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 
+from vestcl import opencl
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
@@ -22,7 +23,6 @@ from vestcl.bench.splat import scenes as _scenes
 from vestcl.bench.splat import torch_fragments as _fragments
 from vestcl.bench.splat import torch_peers as _peers
 from vestcl.evaluation.tables import Grid
-from vestcl.opencl import session as runtime
 from vestcl.opencl import trace
 
 __all__ = ["SplatBench", "main"]
@@ -105,7 +105,7 @@ def _check(config: SplatBench) -> None:
         raise ValueError(f"`radii` must be one or more positive numbers, got {config.radii}")
 
 
-def _measure_device(config: SplatBench, console: Console, session: runtime.Session) -> Results:
+def _measure_device(config: SplatBench, console: Console, session: opencl.Session) -> Results:
     """Everything on one device, printed as it comes."""
     machine = _results.describe(session)
     _results.show_machine(machine, console)
@@ -225,7 +225,7 @@ def _stage(console: Console, name: str) -> Iterator[None]:
         yield
 
 
-def _plot(folder: Path, info: runtime.DeviceInfo, details: dict[str, Any]) -> None:
+def _plot(folder: Path, info: opencl.DeviceInfo, details: dict[str, Any]) -> None:
     """What was measured on one device."""
     device = f"{info.platform} / {info.name}"
     for name, over in (("scaling", "size"), ("channels", "channels")):

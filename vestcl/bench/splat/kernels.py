@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
+from vestcl import opencl
 from vestcl.bench.common.timing import Spread, watching_others
 from vestcl.bench.splat.measure import Facts, both_passes, facts_of
 from vestcl.bench.splat.scenes import Scene
-from vestcl.opencl import session as runtime
 from vestcl.ops.splat import rasterize
 
 #: Profiled calls.
@@ -46,7 +46,7 @@ class Profile:
 
 def measure_kernels(scene: Scene) -> Profile:
     """Profile `CALLS` calls of forward + backward."""
-    task, session = both_passes(scene, Scene.forward), runtime.current()
+    task, session = both_passes(scene, Scene.forward), opencl.current()
     task()
     walls, calls = [], []
     with watching_others() as others:

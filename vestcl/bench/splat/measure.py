@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from vestcl import reference
+from vestcl import opencl, reference
 from vestcl.bench.common.timing import (
     Others,
     Spread,
@@ -22,7 +22,6 @@ from vestcl.bench.common.timing import (
 )
 from vestcl.bench.splat.scenes import DIFFERENTIATED, Scene
 from vestcl.bench.splat.torch_fragments import list_fragments
-from vestcl.opencl import session as runtime
 
 Splatter = Callable[[Scene], torch.Tensor]
 """Makes the image of a scene."""
@@ -237,7 +236,7 @@ class Memory:
 
 def measure_memory(scene: Scene) -> Memory:
     """The pool that one forward + backward leaves behind: it never shrinks by itself, so that is its peak."""
-    session = runtime.current()
+    session = opencl.current()
     session.free_scratch()
     before = session.scratch_bytes
     both_passes(scene, Scene.forward)()

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from vestcl import reference
+from vestcl import opencl, reference
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
@@ -22,7 +22,6 @@ from vestcl.bench.splat.bench import CHANNELS
 from vestcl.bench.splat.scenes import AHEAD
 from vestcl.data import Street, intrinsics
 from vestcl.evaluation.tables import Grid
-from vestcl.opencl import session as runtime
 from vestcl.opencl import trace
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
@@ -216,7 +215,7 @@ def _inside(task: Task) -> tuple[Spread, Spread]:
     """Seconds of kernels, and of calls without any kernel running."""
     kernels, around = [], []
     for _ in range(CALLS):
-        with runtime.current().profile() as times:
+        with opencl.current().profile() as times:
             start = time.perf_counter()
             task()
             wall = time.perf_counter() - start
@@ -232,7 +231,7 @@ def _error(got: Tensors, true: Tensors) -> float:
 # ---------------------------------------------------------------- one device's results
 
 
-def _measure_device(config: OperatorsBench, console: Console, session: runtime.Session) -> Results:
+def _measure_device(config: OperatorsBench, console: Console, session: opencl.Session) -> Results:
     machine = _results.describe(session)
     _results.show_machine(machine, console)
     torch.manual_seed(config.seed)
@@ -286,7 +285,7 @@ def _grid(config: OperatorsBench, timed: list[Timed]) -> Grid:
     return Grid(f"Operators, {size}", heading, tuple(rows), notes)
 
 
-def _plot(folder: Path, info: runtime.DeviceInfo, timed: list[Timed]) -> None:
+def _plot(folder: Path, info: opencl.DeviceInfo, timed: list[Timed]) -> None:
     """Times beside twin and copy, and where the time goes."""
 
     def group(field: str) -> Mapping[str, Spread]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import tyro
 
+from vestcl import opencl
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.results import Measure, Results
@@ -15,7 +16,6 @@ from vestcl.bench.splat import report as _report
 from vestcl.bench.splat.roofs import Roofline, roofline
 from vestcl.bench.splat.scenes import street
 from vestcl.evaluation.tables import Grid
-from vestcl.opencl import session as runtime
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -149,7 +149,7 @@ def main(config: RooflineBench) -> None:
     _results.tell_written(console, config.json, config.markdown, config.plots)
 
 
-def _measure_device(config: RooflineBench, session: runtime.Session) -> Results:
+def _measure_device(config: RooflineBench, session: opencl.Session) -> Results:
     found = []
     for radius in config.radii:
         scene = street(config.height, config.width, config.channels, radius, config.seed)

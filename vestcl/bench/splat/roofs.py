@@ -1,7 +1,7 @@
 """Each splat kernel beside the roofs of its device.
 
 A kernel that moves b bytes and computes f flops takes at least max(b / bandwidth, f / peak). Both roofs are measured in
-turns with the kernels: a copy past the cache, and chains of multiply-adds, both in OpenCL (kernels/splat_roofline.cl).
+turns with the kernels: a copy past the cache, and chains of multiply-adds, both in OpenCL (kernels/splat/splat_roofline.cl).
 """
 
 import statistics
@@ -14,17 +14,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl import opencl
 from vestcl.bench.common.timing import Spread, watching_others
 from vestcl.bench.splat.kernels import bytes_of, flops_of
 from vestcl.bench.splat.measure import Facts, both_passes, facts_of
 from vestcl.bench.splat.scenes import Scene
-from vestcl.opencl import session as runtime
 
 Floats = NDArray[np.float64]
 
-_FILE: Final = "splat_roofline.cl"
+_FILE: Final = "splat/splat_roofline.cl"
 
-#: Of kernels/splat_roofline.cl: bytes that a work-group copies, and flops of a work-item's round.
+#: Of kernels/splat/splat_roofline.cl: bytes that a work-group copies, and flops of a work-item's round.
 _BLOCK_BYTES: Final = 1024 * 16 * 4
 _ROUND_FLOPS: Final = 10 * 16 * 2
 
@@ -93,7 +93,7 @@ def roofline(scene: Scene, calls: int = 30, copy_bytes: int = COPY_BYTES) -> Roo
     """
     if calls < 1 or copy_bytes < 1:
         raise ValueError(f"`calls` and `copy_bytes` must be positive, got {calls} and {copy_bytes}")
-    task, session, roofs = both_passes(scene, Scene.forward), runtime.current(), _Roofs(copy_bytes)
+    task, session, roofs = both_passes(scene, Scene.forward), opencl.current(), _Roofs(copy_bytes)
     task()
     rounds, walls = [], []
     with watching_others() as others:
@@ -121,7 +121,7 @@ def roofline(scene: Scene, calls: int = 30, copy_bytes: int = COPY_BYTES) -> Roo
     return Roofline(facts, bandwidth, peak, points, Spread.of(np.array(walls)), kernels, between, others.cores)
 
 
-def _seconds(times: Sequence[runtime.KernelTime], name: str) -> float:
+def _seconds(times: Sequence[opencl.KernelTime], name: str) -> float:
     return sum(kernel.end_ns - kernel.start_ns for kernel in times if kernel.name == name) / 1e9
 
 
@@ -133,10 +133,10 @@ def _point(name: str, launches: int, seconds: Floats, moved: int, flops: int, ba
 
 
 class _Roofs:
-    """What measures the roofs: launches of kernels/splat_roofline.cl on memory that has been written before."""
+    """What measures the roofs: launches of kernels/splat/splat_roofline.cl on memory that has been written before."""
 
     def __init__(self, copy_bytes: int) -> None:
-        self._session = runtime.current()
+        self._session = opencl.current()
         mapping = self._session.mapping
         self._local, self._rounds = _LOCAL[mapping], ROUNDS[mapping]
         self._blocks = -(-copy_bytes // _BLOCK_BYTES)

@@ -15,6 +15,7 @@ from typing import Any, Final
 import torch
 from rich.console import Console
 
+from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.results import Measure, Results
@@ -24,7 +25,6 @@ from vestcl.bench.stability.cases import FAMILIES, Case, Family
 from vestcl.bench.stability.peers import LEFT_OUT, peers_of
 from vestcl.bench.stability.programs import OPERATORS, Operators, Outcome, evaluate, relative_error
 from vestcl.evaluation.tables import Grid, to_rich
-from vestcl.opencl import session as runtime
 
 _NORM: Final = "Errors are max |float32 - float64| / max |float64| over each array; shown is the worst array's."
 
@@ -118,7 +118,7 @@ def main(config: StabilityBench) -> int:
     console = _results.console()
     rows: list[list[Row]] = []
 
-    def measure(session: runtime.Session) -> Results:
+    def measure(session: opencl.Session) -> Results:
         _results.show_machine(_results.describe(session), console)
         with _timing.torch_threads(config.threads):
             found = list(measure_rows(families, config, console))
@@ -180,21 +180,21 @@ def _errors(case: Case, operators: Operators, truth: Outcome, left_out: str | No
 @contextlib.contextmanager
 def _float64() -> Iterator[None]:
     """Run operators on the current device where it has float64, else on the default one, else on any that has."""
-    info = runtime.current().info
+    info = opencl.current().info
     if info.float64:
         yield
         return
-    able = [other for other in (runtime.select(), *runtime.devices()) if other.float64]
+    able = [other for other in (opencl.select(), *opencl.devices()) if other.float64]
     if not able:
-        raise runtime.DeviceError("no OpenCL device has float64, which the truth needs: see `vestcl devices`")
-    with runtime.use(able[0].index):
+        raise opencl.DeviceError("no OpenCL device has float64, which the truth needs: see `vestcl devices`")
+    with opencl.use(able[0].index):
         yield
 
 
 # ---------------------------------------------------------------- report
 
 
-def report(session: runtime.Session, config: StabilityBench, rows: list[Row]) -> Results:
+def report(session: opencl.Session, config: StabilityBench, rows: list[Row]) -> Results:
     """Of one device."""
     measures = []
     for row in rows:

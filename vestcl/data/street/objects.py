@@ -64,7 +64,7 @@ def solid(
     taper: Vector = (0.0, 0.0, 0.0),
     seed: int = 0,
 ) -> Solids:
-    """One solid, [1], unturned; see kernels/raycast_types.h for its fields."""
+    """One solid, [1], unturned; see kernels/raycast/raycast_types.h for its fields."""
     return np.array([(centre, half_size, (1.0, 0.0), taper, tint, shape, material, label, seed, 0)], SOLID)
 
 

@@ -1,6 +1,6 @@
 """Launcher of the ray caster: solids seen by a pinhole camera, as colour, z-depth and Cityscapes train ids.
 
-A pixel's ray is s (R K^-1) (u, v, 1), scaled so that s is its z-depth; see kernels/raycast.cl.
+A pixel's ray is s (R K^-1) (u, v, 1), scaled so that s is its z-depth; see kernels/raycast/raycast.cl.
 """
 
 from dataclasses import dataclass
@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl import constants
-from vestcl.opencl import session as runtime
+from vestcl import constants, opencl
 
 #: z-depth of the sky in metres: far enough that a metre's move shifts it by less than a pixel, and finite.
 SKY_DEPTH: Final = 1000.0
@@ -69,7 +68,7 @@ class Label(IntEnum):
 FOREGROUND: Final = (Label.POLE, Label.PERSON, Label.CAR)
 
 
-#: One solid, as kernels/raycast_types.h lays it out. Axes and metres as everywhere; tint is linear RGB.
+#: One solid, as kernels/raycast/raycast_types.h lays it out. Axes and metres as everywhere; tint is linear RGB.
 SOLID: Final = np.dtype(
     [
         ("centre", np.float32, 3),
@@ -110,7 +109,7 @@ _COARSE, _NEWTON = 16, 5
 #: On a bent street a pixel's rays are shaded as one where the mean of their 1 / z differs from the centre's by less.
 _SMOOTH: Final = "1e-3f"
 
-#: One point of it, as kernels/raycast_types.h lays it out.
+#: One point of it, as kernels/raycast/raycast_types.h lays it out.
 COURSE: Final = np.dtype(
     [("place", np.float32, 2), ("ahead", np.float32, 2), ("curvature", np.float32), ("along", np.float32)]
 )
@@ -189,7 +188,7 @@ def cast(
     cells = int(2 * SHADOW_REACH / SHADOW_CELL)
     crossings = scene.crossings if len(scene.crossings) else np.zeros((1, 2), np.float32)
     inputs = (_view(scene, camera_from_world, K, samples), scene.solids, crossings)
-    with runtime.current().job() as job:
+    with opencl.current().job() as job:
         view, solids, side_streets = (job.read(array) for array in inputs)
         image_rects, shadow_cells = job.scratch(4 * count, np.int32), job.scratch(4 * count, np.int32)
         shadow_rects = job.scratch(4 * count, np.float32)
@@ -209,22 +208,22 @@ def cast(
         _launch(job, "raycast", (tile_rows * tile_columns, tile), arguments, (1, tile), bent=bent)
 
 
-def _outputs(job: runtime.Job, frame: Frame, index: int) -> list[runtime.Argument]:
-    outputs: list[runtime.Argument] = [job.write(a[index]) for a in (frame.colour, frame.depth, frame.labels)]
+def _outputs(job: opencl.Job, frame: Frame, index: int) -> list[opencl.Argument]:
+    outputs: list[opencl.Argument] = [job.write(a[index]) for a in (frame.colour, frame.depth, frame.labels)]
     return [*outputs, job.scratch(1, np.int32) if frame.instances is None else job.write(frame.instances[index])]
 
 
 def _launch(
-    job: runtime.Job,
+    job: opencl.Job,
     name: str,
     global_size: tuple[int, ...],
-    arguments: list[runtime.Argument],
+    arguments: list[opencl.Argument],
     local_size: tuple[int, ...] | None = None,
     *,
     bent: bool,
 ) -> None:
     names = {f"{kind.__name__.upper()}_{m.name}": int(m) for kind in (Shape, Material, Label) for m in kind}
-    defines = runtime.defines_for(
+    defines = opencl.defines_for(
         np.dtype(np.float32), SKY_DEPTH=f"{SKY_DEPTH}f", SHADOW_CELL=f"{SHADOW_CELL}f", **names
     )
     if bent:
@@ -235,14 +234,14 @@ def _launch(
             "NEWTON": _NEWTON,
             "SMOOTH": _SMOOTH,
         }
-    job.launch("raycast.cl", name, defines, global_size, arguments, local_size)
+    job.launch("raycast/raycast.cl", name, defines, global_size, arguments, local_size)
 
 
 def _int32(*values: int) -> list[np.int32]:
     return [np.int32(value) for value in values]
 
 
-def _lists(job: runtime.Job, cells: int, count: int) -> tuple[runtime.Argument, runtime.Argument]:
+def _lists(job: opencl.Job, cells: int, count: int) -> tuple[opencl.Argument, opencl.Argument]:
     return job.scratch(cells * count, np.uint16), job.scratch(cells, np.int32)
 
 
