@@ -2,7 +2,7 @@
 
 import sys
 
-from vestcl.cli import interrupt
+from vestcl import interrupt
 
 if sys.argv[:1] == ["-m"]:  # Python looks for the script that it runs next: its imports take seconds
     interrupt.guard_imports()

@@ -33,21 +33,22 @@ from train.evaluation.setup import Setup
 from train.evaluation.sheets import write_sheets
 from train.evaluation.windows import Part, plan, read_inputs, read_part, run_part
 from train.run.ranks import Ranks, local_rank
-from vestcl import __version__, opencl
+from vestcl import __version__, interrupt, opencl
 from vestcl.bench.common import results as _results
-from vestcl.cli import command_line, interrupt, options
+from vestcl.cli import command_line, options
 from vestcl.cli.prepare import shard
 from vestcl.cli.progress import Bar
-from vestcl.data.inputs import Inputs
 from vestcl.data.street import input as street_input
-from vestcl.evaluation import GEOMETRIC, Record, to_rich
 from vestcl.evaluation.metrics import MS_SSIM_SIDE
 from vestcl.evaluation.perceptual import Lpips, StLpips
+from vestcl.evaluation.scores import GEOMETRIC, Record
+from vestcl.evaluation.tables import to_rich
 from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.forecasting import peer
 from vestcl.io.atomic import write_bytes
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
+from vestcl.scene.inputs import Inputs
 
 #: Columns where tables don't go to a terminal.
 WIDTH: Final = 200

@@ -12,7 +12,8 @@ from typing import ClassVar
 import tyro
 
 from train.command import ERRORS, failed
-from vestcl.cli import command_line, interrupt
+from vestcl import interrupt
+from vestcl.cli import command_line
 from vestcl.models.checkpoint import read_trained_on, write_checkpoint
 from vestcl.models.inference.pretrained import find_model, load_model
 

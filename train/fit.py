@@ -29,8 +29,8 @@ from train.run.ranks import Ranks, lost_processes_named
 from train.run.report import Reporter
 from train.run.trainer import Average, NotANumberError, Trainer, build_model
 from train.settings.config import Config, DataConfig, load_config, to_dict
-from vestcl import opencl
-from vestcl.cli import command_line, interrupt
+from vestcl import interrupt, opencl
+from vestcl.cli import command_line
 from vestcl.data.readers.splits import KITTI_TRAINING
 from vestcl.models.checkpoint import Frames, read_trained_on
 from vestcl.models.config import ModelConfig

@@ -21,17 +21,18 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from train.command import ERRORS, failed
-from vestcl.cli import command_line, interrupt
+from vestcl import interrupt
+from vestcl.cli import command_line
 from vestcl.cli import main as cli
 from vestcl.cli.prepare import open_input, plan, shard
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
-from vestcl.data.times import is_same
 from vestcl.forecasting.geometric import Perception, forecast_frames
 from vestcl.forecasting.network.planes import forecast_planes
 from vestcl.forecasting.result import View
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.config import FORECAST_PLANES
+from vestcl.times import is_same
 
 #: Frames before t that perception looks at, t included; and by how many frames the next window's t is later.
 CONTEXT: Final = 3

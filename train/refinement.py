@@ -30,7 +30,7 @@ from train.run.losses import Perceptual, build_perceptual, image_terms
 from train.run.trainer import learning_rate_factor
 from train.settings.config import RULES, Count, CountOrNone, LossConfig, OptimiserConfig, RunConfig, Share, Stage
 from train.settings.yaml_files import in_words, read_settings
-from vestcl.cli import interrupt
+from vestcl import interrupt
 from vestcl.io import atomic
 from vestcl.models.checkpoint import read_trained_on, write_checkpoint
 from vestcl.models.config import ModelConfig, RefineConfig

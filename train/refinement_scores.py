@@ -19,7 +19,8 @@ from rich.table import Table
 
 from train.command import ERRORS, failed
 from train.forecasts import Entry, unpack
-from vestcl.cli import command_line, interrupt
+from vestcl import interrupt
+from vestcl.cli import command_line
 from vestcl.evaluation import metrics
 from vestcl.evaluation.perceptual import StLpips, squeeze_distance
 from vestcl.evaluation.trunks.trunks import load_trunk

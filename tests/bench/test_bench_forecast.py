@@ -17,7 +17,7 @@ from vestcl.bench.forecast import truth as known
 from vestcl.bench.forecast.bench import HELD_OUT, ForecastBench
 from vestcl.bench.forecast.windows import GEOMETRIC, ORACLE, SOURCE, TRUE_POSES, Prediction, Record, Truth
 from vestcl.cli import main as cli
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.calibration import invert
 from vestcl.data.sample import Clip, Sample
 from vestcl.evaluation import metrics, perceptual
@@ -35,8 +35,8 @@ TINY: dict[str, Any] = {
 SOURCE_VIEW = View(SOURCE, np.eye(4))
 
 
-def street_clip(seed: int = 3, frames: int = 6, samples: int = 1) -> Clip:
-    return Street.generate(seed).clip(frames, *SIZE, samples=samples)
+def clip_of_street(seed: int = 3, frames: int = 6, samples: int = 1) -> Clip:
+    return street_clip(Street.generate(seed), frames, *SIZE, samples=samples)
 
 
 def rendered(image: np.ndarray, motion: np.ndarray | None = None, depth: np.ndarray | None = None) -> Rendered:
@@ -61,7 +61,7 @@ def true_forecast(clip: Clip, index: int, steps: int, offset: float = 0.0) -> Fo
 
 
 def test_true_motion_brings_a_point_of_the_world_from_camera_to_camera() -> None:
-    clip = street_clip()
+    clip = clip_of_street()
     motions = known.true_motion(clip, 1, 3)
     assert motions is not None and len(motions) == 3
     point = np.array([1.0, -2.0, 30.0, 1.0])
@@ -78,7 +78,7 @@ def test_true_motion_needs_every_pose() -> None:
 
 
 def test_step_truth_is_the_cameras_motion_where_nothing_moves() -> None:
-    clip = street_clip()
+    clip = clip_of_street()
     cur, prev = clip[3], clip[2]
     assert cur.world_from_cam is not None and prev.world_from_cam is not None
     v, u = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
@@ -91,7 +91,7 @@ def test_step_truth_is_the_cameras_motion_where_nothing_moves() -> None:
 
 
 def test_motion_errors_are_what_was_put_in() -> None:
-    clip = street_clip()
+    clip = clip_of_street()
     errors = known.motion_errors(true_forecast(clip, 1, 2, offset=0.25), clip, 1, SOURCE)
     np.testing.assert_allclose(errors["motion_m"], 0.25, atol=1e-5)
     np.testing.assert_allclose(errors["motion_known"], 1.0)
@@ -101,7 +101,7 @@ def test_motion_errors_are_what_was_put_in() -> None:
 
 
 def test_pixels_without_a_motion_count_as_unknown() -> None:
-    clip = street_clip()
+    clip = clip_of_street()
     frame = true_forecast(clip, 1, 1).frames[0][SOURCE]
     depth = np.zeros((1, *SIZE), np.float32)
     depth[:, :, 100:] = 1
@@ -124,7 +124,7 @@ def test_ego_errors_by_hand() -> None:
 
 
 def test_the_splatter_alone_is_close_to_warping() -> None:
-    values = known.splatter_alone(street_clip(samples=2), 2)
+    values = known.splatter_alone(clip_of_street(samples=2), 2)
     loss = values["warped_db"][0] - values["splatted_db"][0]
     assert values["splatter_loss_db"] == [pytest.approx(loss)]
     assert loss < 3 and values["warped_db"][0] > 20 and 0.7 < values["seen"][0] < 1
@@ -143,7 +143,7 @@ def test_only_streets_have_all_truth() -> None:
 
 def test_scores_of_known_errors() -> None:
     """Truth + 0.1 is 20 dB; the same picture, infinitely good."""
-    clip = street_clip()
+    clip = clip_of_street()
     images = [clip[i].read_image() for i in (2, 3)]
     grey = [np.clip(image, 0, 0.8).astype(np.float32) for image in images]
     arrays = tuple(Sample.from_arrays(str(i), image, np.eye(3)) for i, image in enumerate([grey[0], *grey]))
@@ -198,7 +198,7 @@ def test_tables_by_hand() -> None:
 
 
 def test_windows_have_a_frame_before_and_steps_after() -> None:
-    clip = street_clip(frames=6)
+    clip = clip_of_street(frames=6)
     assert list(running.windows_of(clip, ForecastBench(("x",), steps=2))) == [1, 2, 3]
     assert list(running.windows_of(clip, ForecastBench(("x",), steps=1, first=2, every=2))) == [2, 4]
     assert list(running.windows_of(clip, ForecastBench(("x",), steps=1, last=2))) == [1, 2]

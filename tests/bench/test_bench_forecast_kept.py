@@ -13,10 +13,10 @@ from vestcl.bench.forecast.bench import ForecastBench
 from vestcl.bench.forecast.kept import SUFFIX, Kept
 from vestcl.bench.forecast.truth import Facts
 from vestcl.bench.forecast.windows_list import evenly, read_list
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip, Sample
-from vestcl.evaluation import SOURCE, Record, Truth
 from vestcl.evaluation.regions import REGIONS, error_shares
+from vestcl.evaluation.scores import SOURCE, Record, Truth
 from vestcl.forecasting.result import Forecast, Rendered, View
 
 SIZE = 64, 208
@@ -184,7 +184,7 @@ def test_error_shares_by_construction() -> None:
 
 def test_regions_of_a_street_follow_the_camera() -> None:
     """Most of a street is at rest; sky, near and far ground are all there."""
-    clip = Street.generate(4).clip(5, *SIZE, samples=1)
+    clip = street_clip(Street.generate(4), 5, *SIZE, samples=1)
     config = ForecastBench(("street:4",), **TINY)
     (_, facts) = next(running.run_clip(clip, [2], config))
     values = facts[0].values

@@ -10,7 +10,7 @@ import pytest
 from vestcl.bench.forecast import inpaint, open_pixels
 from vestcl.bench.forecast.inpaint import InpaintBench, main, score
 from vestcl.cli.main import main as command
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 
 
 def test_score_of_a_known_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,7 +48,7 @@ def test_an_unknown_method_is_told(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_open_pixels_of_a_street() -> None:
     """Scores of every step, camera and number of frames; more memory covers no fewer of the open pixels."""
-    clip = Street.generate(4).clip(10, 48, 160)
+    clip = street_clip(Street.generate(4), 10, 48, 160)
     assert open_pixels.windows_of(clip, 1, (0, 2)) == [3]
     scores = list(open_pixels.measure(clip, [3], (0, 2), None))
     assert [(one.step, one.memory) for one in scores if one.view == "source"] == [

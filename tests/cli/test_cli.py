@@ -32,7 +32,7 @@ def test_devices_marks_the_one_in_use(capsys: pytest.CaptureFixture[str], monkey
 
 
 def test_devices_is_quick() -> None:
-    code = "import sys; from vestcl import cli; cli.main(['devices']); sys.exit('torch' in sys.modules)"
+    code = "import sys; from vestcl.cli import main as cli; cli.main(['devices']); sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
@@ -98,6 +98,7 @@ def test_bench(monkeypatch: pytest.MonkeyPatch) -> None:
 
     configs: list[object] = []
     put_module(monkeypatch, "vestcl.bench")
+    put_module(monkeypatch, "vestcl.bench.splat")
     put_module(monkeypatch, "vestcl.bench.splat.bench", SplatBench=SplatBench, main=configs.append)
     assert cli.main(["bench", "splat"]) == 0
     assert cli.main(["bench", "splat", "--points", "5"]) == 0
@@ -117,6 +118,7 @@ def test_a_bench_does_not_need_the_others(monkeypatch: pytest.MonkeyPatch) -> No
 
     configs: list[object] = []
     put_module(monkeypatch, "vestcl.bench")
+    put_module(monkeypatch, "vestcl.bench.network")
     put_module(monkeypatch, "vestcl.bench.network.bench", NetworkBench=NetworkBench, main=configs.append)
     assert cli.main(["bench", "network", "--width", "9"]) == 0
     assert configs == [NetworkBench(9)]
@@ -159,6 +161,7 @@ def test_a_bench_with_a_hyphen_and_an_exit_code(monkeypatch: pytest.MonkeyPatch)
         code: int = 1
 
     put_module(monkeypatch, "vestcl.bench")
+    put_module(monkeypatch, "vestcl.bench.network")
     put_module(
         monkeypatch, "vestcl.bench.network.train_step", TrainStepBench=TrainStepBench, main=lambda config: config.code
     )
@@ -186,7 +189,7 @@ def test_a_bench_that_lacks_a_package_says_so(monkeypatch: pytest.MonkeyPatch) -
 
 def test_help_of_forecast_needs_no_torch() -> None:
     code = (
-        "import sys\nfrom vestcl import cli\n"
+        "import sys\nfrom vestcl.cli import main as cli\n"
         "try:\n    cli.main(['forecast', '--help'])\nexcept SystemExit as end:\n"
         "    sys.exit(end.code or 'torch' in sys.modules or 'cv2' in sys.modules)"
     )

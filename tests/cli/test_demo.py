@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from vestcl.cli import demo
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.forecasting.views import parse_view
 from vestcl.models import configuration
 from vestcl.models.forecaster import Forecaster
@@ -63,14 +63,14 @@ def test_an_unknown_model(tmp_path: Path) -> None:
 
 
 def test_the_forecast_gets_no_truth() -> None:
-    clip = demo.stereo_only(Street.generate(1).clip(2, 48, 160))
+    clip = demo.stereo_only(street_clip(Street.generate(1), 2, 48, 160))
     assert all(sample.depth is None and sample.world_from_cam is None for sample in clip)
     assert all(sample.right is not None for sample in clip)
 
 
 def test_the_truth_from_a_view_of_the_rig_is_what_the_rig_sees() -> None:
     street = Street.generate(1)
-    clip = street.clip(2, 48, 160, start=demo.START, fps=demo.FPS, samples=demo.SAMPLES)
+    clip = street_clip(street, 2, 48, 160, start=demo.START, fps=demo.FPS, samples=demo.SAMPLES)
     right = clip[1].right
     assert right is not None
     truth = demo.true_image(street, clip, 1, parse_view("right", clip[1]))

@@ -7,8 +7,8 @@ import pytest
 from data_files import pose, row, write_pictures, write_text
 
 from vestcl import io
-from vestcl.data.inputs import inputs_of
 from vestcl.data.readers.kitti_raw import EARTH_RADIUS, mercator_pose, open_kitti_raw
+from vestcl.scene.inputs import inputs_of
 
 #: Of 2011_09_26's published calib_cam_to_cam.txt.
 P2 = "7.215377e+02 0 6.095593e+02 4.485728e+01 0 7.215377e+02 1.728540e+02 2.163791e-01 0 0 1 2.745884e-03"

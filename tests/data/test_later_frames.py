@@ -1,4 +1,4 @@
-"""vestcl.data.later_frames and what perceives a forecast frame."""
+"""vestcl.forecasting.network.later_frames and what perceives a forecast frame."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import torch
 from forecaster_scenes import SMALL, TINY
 
 from vestcl.constants import SKY_DEPTH
-from vestcl.data.later_frames import later_frames
+from vestcl.forecasting.network.later_frames import later_frames
 from vestcl.io.labels import SKY
 from vestcl.models.forecaster import perceive_estimated, perceive_forecast
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from vestcl import opencl
-from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
+from vestcl.data import SKY_DEPTH, Label, Street, intrinsics, street_clip
 from vestcl.data.calibration import invert, translation
-from vestcl.data.street import clip as street_clip
+from vestcl.data.street import clip as clip_module
 from vestcl.scene.depth.stereo import stereo_depth
 
 HEIGHT, WIDTH = 48, 160
@@ -19,14 +19,14 @@ HEIGHT, WIDTH = 48, 160
 @pytest.fixture(autouse=True)
 def _fresh() -> Iterator[None]:
     """No frame of another test or device."""
-    street_clip._rendered.cache_clear()
+    clip_module._rendered.cache_clear()
     yield
-    street_clip._rendered.cache_clear()
+    clip_module._rendered.cache_clear()
 
 
 def test_frames_are_the_streets(session: opencl.Session) -> None:
     street = Street.generate(2)
-    clip = street.clip(3, HEIGHT, WIDTH, start=1.0, fps=5.0, baseline=0.6, samples=2)
+    clip = street_clip(street, 3, HEIGHT, WIDTH, start=1.0, fps=5.0, baseline=0.6, samples=2)
     assert len(clip) == 3
     assert clip.fps == 5.0
     for index, sample in enumerate(clip):
@@ -46,8 +46,8 @@ def test_frames_are_the_streets(session: opencl.Session) -> None:
 
 
 def test_every_picture_is_rendered_once(session: opencl.Session) -> None:
-    clip = Street.generate(0).clip(2, HEIGHT, WIDTH)
-    rendered = street_clip._rendered.cache_info
+    clip = street_clip(Street.generate(0), 2, HEIGHT, WIDTH)
+    rendered = clip_module._rendered.cache_info
     assert rendered().misses == 0
     first = clip[0]
     image = first.read_image()
@@ -61,7 +61,7 @@ def test_every_picture_is_rendered_once(session: opencl.Session) -> None:
 
 
 def test_reads_as_any_clip(session: opencl.Session) -> None:
-    clip = Street.generate(1).clip(3, HEIGHT, WIDTH)
+    clip = street_clip(Street.generate(1), 3, HEIGHT, WIDTH)
     labels, depth = clip[0].read_labels(), clip[0].read_depth()
     assert np.array_equal(depth == SKY_DEPTH, labels == Label.SKY)
     assert np.array_equal(clip[0].read_mask(), ~np.isin(labels, (Label.CAR, Label.POLE, Label.PERSON)))
@@ -79,7 +79,7 @@ def test_reads_as_any_clip(session: opencl.Session) -> None:
 
 def test_background_clip(session: opencl.Session) -> None:
     street = Street.generate(3)
-    whole, bare = street.clip(1, HEIGHT, WIDTH)[0], street.clip(1, HEIGHT, WIDTH, foreground=False)[0]
+    whole, bare = street_clip(street, 1, HEIGHT, WIDTH)[0], street_clip(street, 1, HEIGHT, WIDTH, foreground=False)[0]
     assert bare.read_mask().all()
     seen = whole.read_mask()
     assert not seen.all()
@@ -89,7 +89,7 @@ def test_background_clip(session: opencl.Session) -> None:
 def test_motion_between_samples(session: opencl.Session) -> None:
     """Poses and times of the samples are all that `Street.motion` asks for."""
     street = Street.generate(0)
-    cur, after = street.clip(2, HEIGHT, WIDTH)
+    cur, after = street_clip(street, 2, HEIGHT, WIDTH)
     poses = invert(cur.world_from_cam), invert(after.world_from_cam)
     displacement = street.motion(*poses, cur.K, HEIGHT, WIDTH, cur.timestamp, after.timestamp)
     road = cur.read_labels()[0] == Label.ROAD
@@ -99,7 +99,7 @@ def test_motion_between_samples(session: opencl.Session) -> None:
 
 def test_stereo_finds_the_depth(session: opencl.Session) -> None:
     """The pair is textured and rectified: semi-global matching gets its depth."""
-    sample = Street.generate(0).clip(1, 128, 416, samples=2)[0]
+    sample = street_clip(Street.generate(0), 1, 128, 416, samples=2)[0]
     right = sample.right
     found = stereo_depth(sample.read_image(), right.read_image(), sample.K, right.right_from_left)
     truth = sample.read_depth()
@@ -121,4 +121,4 @@ def test_stereo_finds_the_depth(session: opencl.Session) -> None:
 )
 def test_refuses(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Street.generate(0).clip(**({"frames": 1, "height": 8, "width": 8} | changes))
+        street_clip(Street.generate(0), **({"frames": 1, "height": 8, "width": 8} | changes))

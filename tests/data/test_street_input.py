@@ -10,8 +10,7 @@ import pytest
 from vestcl import opencl
 from vestcl.cli import main as cli
 from vestcl.cli.prepare import open_input, plan
-from vestcl.data import SKY_DEPTH, Label, Street
-from vestcl.data.inputs import inputs_of
+from vestcl.data import SKY_DEPTH, Label, Street, street_clip
 from vestcl.data.street import input as street_input
 from vestcl.data.street.clip import Shot
 from vestcl.data.street.driving.road import RoadDrive
@@ -20,6 +19,7 @@ from vestcl.data.street.raycast import FOREGROUND
 from vestcl.data.street.sensors import DisturbedLabels, StreetScan
 from vestcl.prepare.clip import frame_keys
 from vestcl.prepare.prepared import find_prepared
+from vestcl.scene.inputs import inputs_of
 
 SIZE = HEIGHT, WIDTH = 48, 160
 
@@ -72,7 +72,7 @@ def test_draws_are_by_seed_and_in_range() -> None:
 
 def test_the_usual_street_stays_as_it_is() -> None:
     """Its frames have the same keys, whatever it is called by."""
-    plain = Street.generate(5).clip(3, *SIZE, samples=1)
+    plain = street_clip(Street.generate(5), 3, *SIZE, samples=1)
     for text in ("street:5", "street:5?drive=usual", "street:5?depth=true,masks=true,fps=10"):
         assert frame_keys(open_input(text, options())) == frame_keys(plain)
     assert open_input("street:5", options()).name == "street 5"

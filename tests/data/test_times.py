@@ -1,4 +1,4 @@
-"""vestcl.data.times, and how clips and readers take it."""
+"""vestcl.times, and how clips and readers take it."""
 
 import re
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import test_data_folder
 import test_data_kitti_odometry
 import test_data_kitti_raw
 
-from vestcl.data import times
+from vestcl import times
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip, Sample
 

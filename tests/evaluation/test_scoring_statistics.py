@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vestcl.evaluation import Record
+from vestcl.evaluation.scores import Record
 from vestcl.evaluation.statistics import Interval, bootstrap, differences, extremes, intervals, unit
 
 

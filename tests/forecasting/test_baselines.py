@@ -11,7 +11,8 @@ import torch
 from PIL import Image
 
 from vestcl.evaluation import metrics
-from vestcl.forecasting.baselines import backward_warp, flow_extrapolation, invert_flow, optical_flow, repeat_last
+from vestcl.forecasting.baselines import flow_extrapolation, repeat_last
+from vestcl.scene.flow.optical_flow import backward_warp, invert_flow, optical_flow
 
 CLIP = Path(__file__).resolve().parents[3] / "shared" / "data" / "kitti_clip" / "image"
 

@@ -6,8 +6,8 @@ import torch
 from data_files import pose
 from geometric_scenes import HEIGHT, WIDTH, Floats, K, Matrix, cloud_of, decibels, flat, noise, planes, room
 
-from vestcl.forecasting.baselines import backward_warp
 from vestcl.forecasting.geometric.render import Cloud, Shown, holes, rendered, show
+from vestcl.scene.flow.optical_flow import backward_warp
 
 EYE = np.eye(4)
 RED, GREEN, BLUE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

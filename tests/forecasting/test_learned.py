@@ -14,7 +14,7 @@ from forecaster_scenes import SMALL, change, stir
 from learned_networks import BOUNDED, model, stir_all
 from torch import nn
 
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip
 from vestcl.forecasting import geometric
 from vestcl.forecasting.geometric import Perception, render
@@ -36,7 +36,7 @@ VIEWS = [View("source", np.eye(4)), View("right", RIGHT), View("again", np.eye(4
 
 @functools.cache
 def clip() -> Clip:
-    return Street.generate(3).clip(7, HEIGHT, WIDTH)
+    return street_clip(Street.generate(3), 7, HEIGHT, WIDTH)
 
 
 @functools.cache

@@ -10,7 +10,7 @@ import pytest
 import torch
 from forecaster_scenes import SMALL, TINY, stir
 
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip
 from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.network.forecast import forecast_clip, forecast_frames, show_frame, what_was_skipped
@@ -19,7 +19,7 @@ from vestcl.forecasting.result import Forecast, Skipped, View
 from vestcl.models.forecaster import Forecaster, perceive_estimated
 from vestcl.models.inference.skipping import Count, Tally
 from vestcl.models.inference.stage_times import REST, STAGES
-from vestcl.prepare.prepared import prepare_frame
+from vestcl.prepare.frame import prepare_frame
 
 HEIGHT, WIDTH = 48, 160
 RIGHT = np.eye(4)
@@ -34,7 +34,7 @@ def perception() -> Perception:
 
 @functools.cache
 def clip() -> Clip:
-    return Street.generate(3).clip(4, HEIGHT, WIDTH)
+    return street_clip(Street.generate(3), 4, HEIGHT, WIDTH)
 
 
 def model(start: str = "prior") -> Forecaster:

@@ -10,12 +10,12 @@ from geometric_scenes import turned
 from numpy.typing import NDArray
 
 from vestcl import geometry
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.network.input import as_motion, last_motions, network_input
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.ego_motion import RigidMotion
-from vestcl.prepare.prepared import Prepared, prepare_frame
+from vestcl.prepare.frame import Prepared, prepare_frame
 from vestcl.scene.layers import Layers
 from vestcl.scene.motion.ego_motion import constant_velocity
 
@@ -97,7 +97,7 @@ def test_the_last_two_motions_are_told() -> None:
 
 
 def test_prior_is_the_measured_motion_at_constant_velocity() -> None:
-    perception = Perception(Street.generate(3).clip(4, 48, 160, samples=1))
+    perception = Perception(street_clip(Street.generate(3), 4, 48, 160, samples=1))
     prev, cur = prepare_frame(perception, 1), prepare_frame(perception, 2)
     got = geometry.compose_rigid(*network_input(prev, cur, last_motions(prev, cur)).prior.next_from_cur)[0]
     wanted = constant_velocity([np.linalg.inv(perception.prev_from_cur(index)) for index in (1, 2)])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip
 from vestcl.evaluation import metrics
 from vestcl.forecasting import peer
@@ -33,7 +33,7 @@ class Stand(VoxelFlowNetwork):
 
 
 def street(frames: int = 6) -> Clip:
-    return Street.generate(3).clip(frames, *SIZE, samples=1)
+    return street_clip(Street.generate(3), frames, *SIZE, samples=1)
 
 
 def decibels(got: np.ndarray, wanted: np.ndarray) -> float:

@@ -15,7 +15,7 @@ from train.data.windows import WindowSet
 from vestcl.bench.forecast import bench
 from vestcl.bench.forecast import run as running
 from vestcl.cli import main as cli
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.calibration import power
 from vestcl.data.sample import Clip
 from vestcl.evaluation import compare
@@ -29,7 +29,8 @@ from vestcl.io.images import to_pixels
 from vestcl.models.config import configuration
 from vestcl.models.inference import pretrained
 from vestcl.prepare.clip import EightBitPerception, frame_keys, prepare_clip
-from vestcl.prepare.prepared import PreparedClip, prepare_frame
+from vestcl.prepare.frame import prepare_frame
+from vestcl.prepare.prepared import PreparedClip
 from vestcl.scene.motion.ego_motion import constant_velocity
 
 SOURCE = View("source", np.eye(4))
@@ -41,7 +42,7 @@ LATE, AFTER_GAP = 3, 7
 
 @functools.cache
 def fine() -> Clip:
-    return Street.generate(4).clip(24, HEIGHT, WIDTH, fps=20.0)
+    return street_clip(Street.generate(4), 24, HEIGHT, WIDTH, fps=20.0)
 
 
 def uneven() -> Clip:
@@ -104,7 +105,7 @@ def test_a_gap_that_is_too_long_to_match(gap: float) -> None:
     """The camera goes on as before the gap, where flow across it is lost; a line says so."""
     street = Street.generate(4)
     seconds = [0.0, 0.1, 0.2, 0.2 + gap / 10, 0.3 + gap / 10]
-    clips = [street.clip(1, HEIGHT, WIDTH, start=second)[0] for second in seconds]
+    clips = [street_clip(street, 1, HEIGHT, WIDTH, start=second)[0] for second in seconds]
     perception = Perception(Clip("street", "street", tuple(clips)))
     assert [perception.is_lost(i) for i in range(5)] == [False, False, False, True, False]
     poses = [clip.world_from_cam for clip in clips]
@@ -232,7 +233,7 @@ def test_times_that_change_velocities_are_in_the_key() -> None:
 
 @functools.cache
 def street() -> list[np.ndarray]:
-    clip = Street.generate(2).clip(20, 96, 256)
+    clip = street_clip(Street.generate(2), 20, 96, 256)
     return [to_pixels(sample.read_image()).astype(np.uint8) for sample in clip]
 
 

@@ -12,7 +12,7 @@ import pytest
 from prepare_scenes import COMMAND
 from stand_ins import put_module
 
-from vestcl.cli import interrupt
+from vestcl import interrupt
 from vestcl.cli import main as cli
 from vestcl.io.atomic import replacing, write_bytes
 

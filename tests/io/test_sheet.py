@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from vestcl.forecasting.result import Rendered
+from vestcl.forecasting.sheets import forecast_sheet
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.contact_sheet import Cell
 
@@ -88,7 +89,7 @@ def test_sheet_of_a_forecast() -> None:
     seen = np.ones((1, 20, 200), np.float32)
     image = np.full((3, 20, 200), 0.2, np.float32)
     frame = Rendered(image, depth, seen, 0 * image)
-    shown = sheet.forecast_sheet([frame, replace(frame, image=image + 0.6)], "street")
+    shown = forecast_sheet([frame, replace(frame, image=image + 0.6)], "street")
     line, gap = 24, 6
     assert shown.shape == (line + 2 * (line + 20) + gap + gap + line, 3 * 200 + 2 * gap, 3)
     first, second = shown[2 * line : 2 * line + 20], shown[3 * line + 20 + gap : 3 * line + 40 + gap]

@@ -13,7 +13,7 @@ import pytest
 import torch
 from forecaster_scenes import SMALL, camera, frame, measured, stir
 
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip
 from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.network.forecast import forecast_clip, forecast_frames
@@ -122,7 +122,7 @@ def at_once(*tasks: Callable[[], Any]) -> list[Any]:
 
 
 def drive(seed: int) -> Clip:
-    return Street.generate(seed).clip(3, 48, 96)
+    return street_clip(Street.generate(seed), 3, 48, 96)
 
 
 def assert_same(got: Forecast, wanted: Forecast) -> None:

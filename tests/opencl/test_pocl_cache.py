@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from vestcl import opencl
-from vestcl.cli import interrupt
+from vestcl import interrupt, opencl
 from vestcl.opencl import icd, pocl_cache
 
 ROOT = Path(__file__).resolve().parents[2]

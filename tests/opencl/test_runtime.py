@@ -38,8 +38,9 @@ def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A kernel folder with scale.cl, in place of vestcl's."""
     (tmp_path / "scale.cl").write_text(SCALE)
     monkeypatch.setattr(programs, "kernel_folder", lambda: tmp_path)
+    uncached = programs.source.__wrapped__  # its cache knows file names only
     for module in (programs, session_module):
-        monkeypatch.setattr(module, "source", opencl.source.__wrapped__)  # its cache knows file names alone
+        monkeypatch.setattr(module, "source", uncached)
     return tmp_path
 
 

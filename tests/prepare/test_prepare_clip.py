@@ -20,7 +20,8 @@ from vestcl.io.video.writing import write_mp4
 from vestcl.prepare import clip as prepare_clip
 from vestcl.prepare.clip import frame_keys
 from vestcl.prepare.files import frame_path
-from vestcl.prepare.prepared import PreparedClip, find_prepared, prepare_frame
+from vestcl.prepare.frame import prepare_frame
+from vestcl.prepare.prepared import PreparedClip, find_prepared
 from vestcl.scene.estimators import with_estimates
 from vestcl.scene.perception import Perception
 

@@ -8,19 +8,20 @@ import numpy as np
 import pytest
 
 from vestcl.constants import SKY_DEPTH
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip, Sample
 from vestcl.io.images import to_float, to_pixels
 from vestcl.prepare.clip import EightBitPerception, prepare_clip
 from vestcl.prepare.files import frame_path, read_tensors, write_clip, write_frame
-from vestcl.prepare.prepared import Prepared, PreparedClip, find_prepared, prepare_frame
+from vestcl.prepare.frame import Prepared, prepare_frame
+from vestcl.prepare.prepared import PreparedClip, find_prepared
 from vestcl.scene.layers import Layers
 
 HEIGHT, WIDTH, FRAMES = 48, 160, 3
 
 
 def street(frames: int = FRAMES) -> Clip:
-    return Street.generate(3).clip(frames, HEIGHT, WIDTH, start=2.0)
+    return street_clip(Street.generate(3), frames, HEIGHT, WIDTH, start=2.0)
 
 
 @pytest.fixture(scope="module")

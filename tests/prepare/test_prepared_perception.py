@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vestcl.data import Street
-from vestcl.data.inputs import Inputs
+from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip
 from vestcl.forecasting.geometric import forecast_frames
 from vestcl.forecasting.peer import forecast_frames as peer_frames
@@ -15,13 +14,14 @@ from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.prepare.clip import EightBitPerception, prepare_clip
 from vestcl.prepare.perception import PreparedPerception, PreparedSequence, as_clip
 from vestcl.prepare.prepared import PreparedClip
+from vestcl.scene.inputs import Inputs
 
 SIZE = 48, 160
 
 
 @pytest.fixture(scope="module")
 def street() -> Clip:
-    return Street.generate(3).clip(4, *SIZE, samples=1)
+    return street_clip(Street.generate(3), 4, *SIZE, samples=1)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from forecaster_scenes import TINY
 from train import export
 from train.run import checkpoint
 from vestcl import io
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.io import depth, exr, images
 from vestcl.io.atomic import write_bytes
 from vestcl.models.forecaster import Forecaster
@@ -38,7 +38,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "depth": lambda path: depth.write_depth(path / "a.npy", np.ones((1, 4, 4), np.float32)),
     "model": lambda path: export_model(path / "half.safetensors"),
     "checkpoint": lambda path: checkpoint.save(path, state_of(1)),
-    "prepared": lambda path: prepare_clip(Street.generate(3).clip(2, 24, 80, samples=1), path / "clip"),
+    "prepared": lambda path: prepare_clip(street_clip(Street.generate(3), 2, 24, 80, samples=1), path / "clip"),
 }
 
 

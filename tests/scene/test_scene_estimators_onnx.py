@@ -10,8 +10,8 @@ import pytest
 from data_files import real
 from onnx_files import FLOAT16, INT64, UINT8, field, model, node, tensor, value_info, write_mix
 
+from vestcl.cli import checks as forecast_checks
 from vestcl.data.open import open_sequence
-from vestcl.forecasting import checks as forecast_checks
 from vestcl.scene.estimators import OnnxDepth, OnnxSegmentation
 from vestcl.scene.estimators._class_tables import TABLES
 from vestcl.scene.estimators._onnx_file import Value, read_onnx

@@ -10,15 +10,15 @@ from corridor_scenes import HEIGHT, WIDTH, K, ahead, drive, off
 from data_files import pose, real
 
 from vestcl.constants import SKY_DEPTH
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.readers.kitti_odometry import open_kitti_odometry
 from vestcl.data.readers.video import open_video
 from vestcl.data.sample import Clip, Sample
-from vestcl.forecasting import baselines
 from vestcl.io.labels import SKY
 from vestcl.scene import perception
 from vestcl.scene.depth.from_motion import CAMERA_HEIGHT, MotionDepth, motion_depth
 from vestcl.scene.depth.stereo import stereo_depth
+from vestcl.scene.flow import optical_flow
 from vestcl.scene.flow import pose as motion_pose
 from vestcl.scene.flow.correspondence import correspond
 from vestcl.scene.flow.parallax import moved_pixels
@@ -229,7 +229,7 @@ def test_correspondence_may_be_given() -> None:
 
 
 def test_street() -> None:
-    clip = Street.generate(3).clip(4, 128, 320, samples=2)
+    clip = street_clip(Street.generate(3), 4, 128, 320, samples=2)
     last = clip[3]
     found = motion_depth([sample.read_image() for sample in clip], last.K, camera_height=1.65)
     depth = last.read_depth()
@@ -254,8 +254,8 @@ def test_motorway_forecast_beats_repeating() -> None:
     motion = constant_velocity([np.asarray(np.linalg.inv(found.prev_from_cur), np.float64)])
     shape = np.zeros((2, *found.depth.shape[1:]), np.float32)
     flow = (rigid_pixels(found.depth, clip[0].K, motion) - moved_pixels(shape)).astype(np.float32)
-    back = baselines.invert_flow(torch.from_numpy(flow)[None])
-    warped = baselines.backward_warp(torch.from_numpy(images[-2])[None], back)[0].numpy()
+    back = optical_flow.invert_flow(torch.from_numpy(flow)[None])
+    warped = optical_flow.backward_warp(torch.from_numpy(images[-2])[None], back)[0].numpy()
     assert psnr(warped, images[-1]) > psnr(images[-2], images[-1]) + 1
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from geometric_scenes import HEIGHT, WIDTH, Floats, K, drive, exact_flow, flat, move, points, room, turned, with_noise
 
+from vestcl.data import street_clip
 from vestcl.scene.flow.correspondence import Correspondence, correspond
 from vestcl.scene.motion.mask import motion_mask, rigid_pixels
 
@@ -69,7 +70,7 @@ def test_empty_streets_as_they_are_seen() -> None:
     """Flow as it is measured, with neither cars nor people: less than 3 % looks as if it moved, most of it road."""
     shares = []
     for seed in range(3):
-        prev, cur = drive(seed).street.clip(2, HEIGHT, WIDTH, foreground=False, samples=2)
+        prev, cur = street_clip(drive(seed).street, 2, HEIGHT, WIDTH, foreground=False, samples=2)
         assert cur.world_from_cam is not None and prev.world_from_cam is not None
         prev_from_cur = np.linalg.inv(prev.world_from_cam) @ cur.world_from_cam
         flow = correspond(cur.read_image(), prev.read_image())

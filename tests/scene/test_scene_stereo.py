@@ -10,8 +10,8 @@ from data_files import real
 from numpy.typing import NDArray
 
 from vestcl.data.open import open_sequence
-from vestcl.forecasting.baselines import backward_warp
 from vestcl.scene.depth.stereo import stereo_depth
+from vestcl.scene.flow.optical_flow import backward_warp
 
 HEIGHT, WIDTH, FOCAL, BASELINE = 96, 256, 200.0, 0.5
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip, Sample
 from vestcl.prepare.clip import prepare_clip
 from vestcl.prepare.prepared import PreparedClip
@@ -33,7 +33,7 @@ Rng = np.random.Generator
 
 def street() -> Clip:
     """With a right camera, depth, labels and poses."""
-    return Street.generate(3).clip(FRAMES, HEIGHT, WIDTH, start=2.0, samples=1)
+    return street_clip(Street.generate(3), FRAMES, HEIGHT, WIDTH, start=2.0, samples=1)
 
 
 def bare() -> Clip:

@@ -8,7 +8,7 @@ import numpy as np
 from data_files import pose
 from numpy.typing import NDArray
 
-from vestcl.data import Street, intrinsics
+from vestcl.data import Street, intrinsics, street_clip
 from vestcl.data.sample import Clip
 from vestcl.forecasting.geometric.render import Cloud
 from vestcl.scene.flow.correspondence import Correspondence
@@ -144,4 +144,4 @@ class Drive(NamedTuple):
 def drive(seed: int, frames: int = 8, start: float = 0.0, samples: int = 1) -> Drive:
     """A street's clip at the small size."""
     street = Street.generate(seed)
-    return Drive(street, street.clip(frames, HEIGHT, WIDTH, start=start, samples=samples))
+    return Drive(street, street_clip(street, frames, HEIGHT, WIDTH, start=start, samples=samples))

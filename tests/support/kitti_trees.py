@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from data_files import row, write_text
 
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.readers.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST
 from vestcl.data.sample import Sample
 from vestcl.io import write_pixels
@@ -43,7 +43,7 @@ def drives(
     scans: bool = False,
 ) -> Path:
     """One street, seen by both cameras of KITTI's rig, as every one of the drives; with laser scans if asked for."""
-    clip = Street.generate(seed).clip(frames, *size, samples=1)
+    clip = street_clip(Street.generate(seed), frames, *size, samples=1)
     K, right = clip[0].K, clip[0].right
     assert right is not None
     flat = f"{K[0, 0]} 0 {K[0, 2] - 0.5} {{}} 0 {K[1, 1]} {K[1, 2] - 0.5} 0 0 0 1 0"

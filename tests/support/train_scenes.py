@@ -21,7 +21,7 @@ from train import fit
 from train.run import checkpoint
 from train.run.report import Reporter
 from train.settings.config import Config, from_dict
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.models import config
 from vestcl.prepare.clip import prepare_clip
 
@@ -50,7 +50,7 @@ SETTINGS: Final[dict[str, Any]] = {
 
 def prepare_street(folder: Path, frames: int = 5, height: int = HEIGHT, width: int = WIDTH, seed: int = 3) -> Path:
     """A street's first frames, prepared."""
-    prepare_clip(Street.generate(seed).clip(frames, height, width), folder / f"street-{seed}")
+    prepare_clip(street_clip(Street.generate(seed), frames, height, width), folder / f"street-{seed}")
     return folder
 
 

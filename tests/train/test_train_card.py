@@ -24,7 +24,7 @@ from train.run import checkpoint
 from train.run.report import LOG
 from train.settings.config import from_dict, load_config, to_dict
 from vestcl.data import Street
-from vestcl.evaluation import GEOMETRIC, Record
+from vestcl.evaluation.scores import GEOMETRIC, Record
 from vestcl.io.images import read_pixels, write_pixels
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare.files import JSON, RECIPE

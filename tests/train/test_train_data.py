@@ -16,12 +16,13 @@ from torch.nn import functional
 
 from train.data.windows import Batch, Draw, WindowSet, loader
 from vestcl import geometry
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.forecasting.network.input import last_motions, network_input
 from vestcl.models.forecaster import Forecaster
 from vestcl.ops.unproject import unproject
 from vestcl.prepare.clip import prepare_clip
-from vestcl.prepare.prepared import Prepared, PreparedClip, find_prepared
+from vestcl.prepare.frame import Prepared
+from vestcl.prepare.prepared import PreparedClip, find_prepared
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -74,7 +75,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two streets, prepared."""
     folder = tmp_path_factory.mktemp("cache")
     for seed in (3, 5):
-        prepare_clip(Street.generate(seed).clip(FRAMES, HEIGHT, WIDTH, samples=2), folder / f"street {seed}")
+        prepare_clip(street_clip(Street.generate(seed), FRAMES, HEIGHT, WIDTH, samples=2), folder / f"street {seed}")
     return folder
 
 

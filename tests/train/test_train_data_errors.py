@@ -7,7 +7,7 @@ import pytest
 from test_train_data import HEIGHT, WIDTH, FakeClip, fakes
 
 from train.data.windows import Draw, WindowSet, loader
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.prepare.clip import prepare_clip
 from vestcl.prepare.prepared import PreparedClip, find_prepared
 
@@ -51,7 +51,7 @@ def test_several_sizes_need_a_crop() -> None:
 
 
 def test_a_frame_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    prepare_clip(Street.generate(3).clip(4, HEIGHT, WIDTH, samples=1), tmp_path / "clip")
+    prepare_clip(street_clip(Street.generate(3), 4, HEIGHT, WIDTH, samples=1), tmp_path / "clip")
     windows = WindowSet(find_prepared(tmp_path))
     next(iter((tmp_path / "clip").glob("*2.safetensors"))).unlink()
     label = windows.label(Draw(0, 1, 1, False, (0,)))
@@ -62,7 +62,7 @@ def test_a_frame_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_worker_s_error_is_a_line(tmp_path: Path, workers: int) -> None:
-    prepare_clip(Street.generate(3).clip(4, HEIGHT, WIDTH, samples=1), tmp_path / "clip")
+    prepare_clip(street_clip(Street.generate(3), 4, HEIGHT, WIDTH, samples=1), tmp_path / "clip")
     for path in (tmp_path / "clip").glob("*.safetensors"):
         path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(ValueError, match=r"^[^\n]*safetensors: is damaged [^\n]*; run `vestcl prepare` again$"):

@@ -26,8 +26,8 @@ from vestcl.data.readers.splits import (
     KITTI_VIEWS_TEST,
     KITTI_VIEWS_TRAIN,
 )
-from vestcl.evaluation import GEOMETRIC, ORACLE, OTHER_CAMERA
 from vestcl.evaluation.compare import FLOW, REPEAT
+from vestcl.evaluation.scores import GEOMETRIC, ORACLE, OTHER_CAMERA
 from vestcl.forecasting import peer
 from vestcl.io import read_pixels
 from vestcl.models.checkpoint import write_checkpoint

@@ -23,15 +23,16 @@ from train.evaluation.protocols import NOW, NOW_BORDER, PROTOCOLS, Name
 from train.evaluation.setup import Setup
 from train.evaluation.windows import forecast, inputs_of, perceptions_of, prepared, presenters, views_of, window
 from vestcl.cli.forecast import Estimators
-from vestcl.data import Street
-from vestcl.data.inputs import Inputs
+from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip, RightCamera
 from vestcl.data.sources import DisparityFile, ImageArray
-from vestcl.evaluation import GEOMETRIC, SOURCE, Truth, metrics
+from vestcl.evaluation import metrics
 from vestcl.evaluation.border import blacken_border
+from vestcl.evaluation.scores import GEOMETRIC, SOURCE, Truth
 from vestcl.forecasting.result import View
 from vestcl.forecasting.views import parse_view
 from vestcl.models.forecaster import Forecaster
+from vestcl.scene.inputs import Inputs
 
 SIZE = 48, 160
 
@@ -39,7 +40,7 @@ SIZE = 48, 160
 @pytest.fixture(scope="module")
 def clip() -> Clip:
     """With depth, and a right camera."""
-    return Street.generate(3).clip(5, *SIZE, samples=1)
+    return street_clip(Street.generate(3), 5, *SIZE, samples=1)
 
 
 def without_depth(clip: Clip) -> Clip:

@@ -16,9 +16,9 @@ from train.evaluate import main
 from train.evaluation.inputs import PAIR
 from train.evaluation.options import Evaluation
 from vestcl.cli import main as cli
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.readers.splits import KITTI_VIEWS_TEST
-from vestcl.evaluation import GEOMETRIC
+from vestcl.evaluation.scores import GEOMETRIC
 from vestcl.io import write_depth
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare.prepared import PreparedClip
@@ -242,7 +242,7 @@ def test_what_prepared_clips_exclude(
 def test_accumulated_depth_is_asked_for_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`proj_depth/groundtruth` has the scans of later frames."""
     data = drives(tmp_path / "kitti", KITTI_VIEWS_TEST, 5)
-    clip = Street.generate(3).clip(5, *SIZE, samples=1)
+    clip = street_clip(Street.generate(3), 5, *SIZE, samples=1)
     for name in KITTI_VIEWS_TEST:
         for index in (2, 3):
             path = data / name[:10] / name / "proj_depth" / "groundtruth" / "image_02" / f"{index:010}.png"

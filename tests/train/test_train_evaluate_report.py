@@ -5,7 +5,8 @@ import dataclasses
 from train.evaluation.protocols import NOW, PROTOCOLS, Protocol
 from train.evaluation.report import Results, as_json, grids, headline, markdown, short_grids, table_of_windows
 from train.evaluation.windows import CAMERA, CONSTANT_VELOCITY
-from vestcl.evaluation import GEOMETRIC, Grid, Record
+from vestcl.evaluation.scores import GEOMETRIC, Record
+from vestcl.evaluation.tables import Grid
 
 NAME = PROTOCOLS["kitti-space"].title
 

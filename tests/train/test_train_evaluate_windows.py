@@ -13,10 +13,11 @@ from st_lpips_weights import public_state
 from train.evaluation.inputs import PAIR, known_of
 from train.evaluation.protocols import NOW, PROTOCOLS
 from train.evaluation.windows import CAMERA, Setup, forecast, perceptions_of, prepared, presenters, views_of, window
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip
-from vestcl.evaluation import GEOMETRIC, SOURCE, Truth, metrics
+from vestcl.evaluation import metrics
 from vestcl.evaluation.perceptual import LPIPS_SCALING, Lpips, StLpips, squeeze_distance
+from vestcl.evaluation.scores import GEOMETRIC, SOURCE, Truth
 from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecasting import peer
 from vestcl.forecasting.geometric import Perception, forecast_frames
@@ -31,7 +32,7 @@ SOURCE_VIEW = View(SOURCE, np.eye(4))
 
 
 def street(frames: int = 5, seed: int = 3) -> Clip:
-    return Street.generate(seed).clip(frames, *SIZE, samples=1)
+    return street_clip(Street.generate(seed), frames, *SIZE, samples=1)
 
 
 def setup(**changes: Any) -> Setup:

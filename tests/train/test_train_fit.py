@@ -18,7 +18,7 @@ from train.run import checkpoint, losses, trainer
 from train.run.checkpoint import CheckpointError
 from train.run.report import LOG, Reporter, read_log
 from train.settings.config import DataConfig
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.readers.splits import KITTI_VIEWS_TEST, KITTI_VIEWS_TRAIN
 from vestcl.models import ObjectMotion, config
 from vestcl.models.checkpoint import read_trained_on, write_checkpoint
@@ -259,7 +259,7 @@ def test_files_with_both_records_are_the_same_bytes(tmp_path: Path) -> None:
 
 def test_only_the_drives_of_a_split_are_shown(tmp_path: Path) -> None:
     """Of a folder that has a training drive and a test drive."""
-    street = Street.generate(3).clip(4, 48, 160, samples=1)
+    street = street_clip(Street.generate(3), 4, 48, 160, samples=1)
     for name in (KITTI_VIEWS_TRAIN[0], KITTI_VIEWS_TEST[0]):
         prepare_clip(dataclasses.replace(street, name=name), tmp_path / name)
     roots = (str(tmp_path),)

@@ -11,7 +11,7 @@ from train.data.windows import Batch, loader
 from train.fit import window_set
 from train.run.ranks import Ranks
 from train.run.trainer import Trainer, build_model
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare.clip import prepare_clip
 
@@ -25,7 +25,7 @@ WANTED, STEPS = 32.0, 400
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Frames t - 1, t and t + 1 of a street, without the steps that one ray a pixel would leave along its edges."""
     folder = tmp_path_factory.mktemp("window")
-    prepare_clip(Street.generate(3).clip(3, 48, 160, samples=4), folder / "street")
+    prepare_clip(street_clip(Street.generate(3), 3, 48, 160, samples=4), folder / "street")
     return folder
 
 

@@ -23,12 +23,13 @@ from train.fit import window_set, with_intervals
 from train.run.ranks import Ranks
 from train.run.trainer import Trainer, build_model
 from vestcl import geometry
-from vestcl.data.inputs import Inputs
 from vestcl.forecasting.network.input import camera_path, last_motions, network_input
 from vestcl.models import config
 from vestcl.models.config import EgoMotionConfig
 from vestcl.models.forecaster import Forecaster
-from vestcl.prepare.prepared import Prepared, PreparedClip
+from vestcl.prepare.frame import Prepared
+from vestcl.prepare.prepared import PreparedClip
+from vestcl.scene.inputs import Inputs
 from vestcl.scene.motion.camera_forecast import forecast_camera
 
 BOUNDED = dataclasses.replace(

@@ -12,7 +12,7 @@ from train.evaluation.protocols import HELD_OUT, NOW, PROTOCOLS, Name, Where, cu
 from train.evaluation.windows import PART_WINDOWS, Part, plan
 from vestcl.bench.forecast.bench import HELD_OUT as BENCH_HELD_OUT
 from vestcl.data.readers.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL, windows
-from vestcl.evaluation import METRICS
+from vestcl.evaluation.tables import METRICS
 from vestcl.io import write_pixels
 
 #: Frames of the synced test drives, as KITTI raw's release has them.

@@ -16,7 +16,7 @@ from train.forecasts import Entry, Window, pack, unpack
 from train.refinement import LOG, STATE, RefinementConfig, Samples, load_config, train, with_forecast_refinement
 from train.run import trainer
 from vestcl.cli.prepare import open_input
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.forecasting.geometric import Perception, forecast_frames
 from vestcl.forecasting.network.planes import forecast_planes
 from vestcl.forecasting.result import View
@@ -86,7 +86,7 @@ def test_the_cache_is_the_same_again_and_keeps_what_is_there(cache: Path, tmp_pa
 
 
 def test_clips_are_forecast_and_compared_at_the_size_asked_for() -> None:
-    clip = Street.generate(3).clip(4, 60, 120).resized(48, 96)
+    clip = street_clip(Street.generate(3), 4, 60, 120).resized(48, 96)
     made = forecasts.entries(Perception(clip), clip, 2, [1], right=True)
     assert [entry.target.shape for entry in made] == [(3, 48, 96)] * 2
     np.testing.assert_array_equal(made[0].target, clip[3].read_image())

@@ -28,7 +28,8 @@ from train.run import checkpoint
 from train.run.checkpoint import State
 from train.run.report import LOG, read_log
 from train.settings.config import Config, from_dict
-from vestcl.cli import command_line, interrupt
+from vestcl import interrupt
+from vestcl.cli import command_line
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.checkpoint import read_checkpoint
 from vestcl.models.inference.pretrained import find_model

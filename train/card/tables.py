@@ -16,7 +16,8 @@ from train.evaluation.inputs import label_of, plain
 from train.fit import window_set
 from train.settings.config import Config, DataConfig, LossConfig
 from vestcl.data import Street
-from vestcl.evaluation import GEOMETRIC, METRICS, Grid, horizon, number, to_markdown
+from vestcl.evaluation.scores import GEOMETRIC
+from vestcl.evaluation.tables import METRICS, Grid, horizon, number, to_markdown
 from vestcl.models.config import ModelConfig
 from vestcl.prepare.prepared import PreparedClip
 

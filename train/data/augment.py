@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vestcl import geometry
 from vestcl.data.resize import resize_image, resize_labels
 from vestcl.forecasting.network.input import CameraPath
-from vestcl.prepare.prepared import Prepared
+from vestcl.prepare.frame import Prepared
 from vestcl.scene.layers import Layers
 
 Element = TypeVar("Element", bound=np.generic)

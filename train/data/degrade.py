@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from train.data.augment import LUMA, Matrix, Window
 from train.settings.config import DegradeConfig
-from vestcl.prepare.prepared import Prepared
+from vestcl.prepare.frame import Prepared
 
 Image = NDArray[np.float32]
 

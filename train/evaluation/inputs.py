@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from train.evaluation.protocols import Protocol
-from vestcl.cli.forecast import Estimators, load_estimators, with_estimates
-from vestcl.data.inputs import Inputs, inputs_of, is_matched
+from vestcl.cli.clip import Estimators, load_estimators, with_estimates
 from vestcl.data.sample import Clip
-from vestcl.evaluation import RIGHT
+from vestcl.evaluation.scores import RIGHT
 from vestcl.forecasting.geometric import Perception
 from vestcl.prepare.perception import PreparedPerception, PreparedSequence
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
+from vestcl.scene.inputs import Inputs, inputs_of, is_matched
 
 Depth = Literal["clip", "motion", "pair"]
 """The clip's own (files, scans, an estimator), that of its motion, or that of its stereo pairs."""

@@ -7,8 +7,8 @@ from typing import Literal
 import tyro
 
 from train.evaluation.protocols import HELD_OUT, Name
-from vestcl.data.later_frames import Perceived
 from vestcl.evaluation.st_lpips import Option as StLpipsOption
+from vestcl.forecasting.network.later_frames import Perceived
 from vestcl.forecasting.network.learned import Learned
 from vestcl.models.forecaster import Mode
 

@@ -28,7 +28,7 @@ from vestcl.data.readers.kitti_raw import open_kitti_raw
 from vestcl.data.readers.splits import CONTEXT, FUTURE, KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
-from vestcl.evaluation import RIGHT, SOURCE
+from vestcl.evaluation.scores import RIGHT, SOURCE
 from vestcl.prepare.perception import as_clip
 from vestcl.prepare.prepared import PreparedClip, find_prepared
 

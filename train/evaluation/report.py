@@ -9,12 +9,11 @@ from typing import Any, Final
 from train.evaluation.inputs import label_of, plain, sentences
 from train.evaluation.protocols import PAPER_NOTE, Protocol
 from train.evaluation.windows import CONSTANT_VELOCITY
-from vestcl.data.inputs import Inputs
-from vestcl.evaluation import (
-    GEOMETRIC,
+from vestcl.evaluation.scores import GEOMETRIC, Record
+from vestcl.evaluation.statistics import Difference, Interval, cell, differences, drawn, interval_grid, intervals
+from vestcl.evaluation.tables import (
     METRICS,
     Grid,
-    Record,
     by_method,
     by_view,
     finite,
@@ -26,7 +25,7 @@ from vestcl.evaluation import (
     summarise,
     to_markdown,
 )
-from vestcl.evaluation.statistics import Difference, Interval, cell, differences, drawn, interval_grid, intervals
+from vestcl.scene.inputs import Inputs
 
 #: What models are held against: the forecast without weights and, for the camera's motion, where that takes it from.
 _BASELINES: Final = (GEOMETRIC, CONSTANT_VELOCITY)

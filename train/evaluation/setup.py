@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 from train.evaluation.inputs import Preprocessing
 from train.evaluation.protocols import Protocol
-from vestcl.data.later_frames import LaterFrames, Perceived, later_frames
 from vestcl.evaluation.perceptual import Lpips, StLpips
 from vestcl.evaluation.trunks.trunks import Trunk
+from vestcl.forecasting.network.later_frames import LaterFrames, Perceived, later_frames
 from vestcl.forecasting.network.learned import Learned
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork

@@ -10,8 +10,9 @@ from train.evaluation.inputs import label_of, plain
 from train.evaluation.protocols import Source
 from train.evaluation.setup import Setup
 from train.evaluation.windows import forecast, perceptions_of, prepared, views_of
-from vestcl.evaluation import GEOMETRIC, METRICS, Record, Truth
+from vestcl.evaluation.scores import GEOMETRIC, Record, Truth
 from vestcl.evaluation.statistics import extremes
+from vestcl.evaluation.tables import METRICS
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.contact_sheet import Cell, Picture
 from vestcl.io.images import write_pixels

@@ -18,10 +18,10 @@ from typing import Any, Final, TypeVar
 from train.evaluation.inputs import label_of, perceptions, plain
 from train.evaluation.protocols import NOW, NOW_BORDER, Protocol, Source, currents
 from train.evaluation.setup import Setup
-from vestcl.data.inputs import Inputs
-from vestcl.data.later_frames import LaterFrames
 from vestcl.data.sample import Clip
-from vestcl.evaluation import (
+from vestcl.evaluation.methods import Method, forecasts_of
+from vestcl.evaluation.motion import ego_errors, true_motion
+from vestcl.evaluation.scores import (
     GEOMETRIC,
     OTHER_CAMERA,
     RIGHT,
@@ -30,20 +30,19 @@ from vestcl.evaluation import (
     Record,
     Timed,
     Truth,
-    ego_errors,
     predictions,
     score,
-    true_motion,
 )
-from vestcl.evaluation.methods import Method, forecasts_of
 from vestcl.forecasting import peer
 from vestcl.forecasting.geometric import Perception, show_frame
 from vestcl.forecasting.network import forecast as network
+from vestcl.forecasting.network.later_frames import LaterFrames
 from vestcl.forecasting.network.learned import Learned
 from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.forecasting.views import parse_view, parse_views
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.forecaster import Forecaster
+from vestcl.scene.inputs import Inputs
 
 #: Windows of a part: a minute or so of work, which is what a killed run may lose, and few enough parts to list.
 PART_WINDOWS: Final = 32

@@ -19,7 +19,7 @@ from vestcl.evaluation.perceptual import VggLoss, squeeze_distance
 from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.models import budget_loss
 from vestcl.models.forecaster import RenderedView, Step
-from vestcl.models.networks.layers import check
+from vestcl.shapes import check
 
 #: (prediction, target), [B, 3, H, W] each -> [B].
 Perceptual = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]

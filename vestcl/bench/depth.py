@@ -12,11 +12,11 @@ from rich.progress import track
 from rich.table import Table
 
 from vestcl.bench.common.results import plain, settings, write_json
-from vestcl.cli.forecast import load_estimators
-from vestcl.data.later_frames import DepthOf
+from vestcl.cli.clip import load_estimators
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.forecasting.geometric import Perception
+from vestcl.forecasting.network.later_frames import DepthOf
 from vestcl.scene.depth import DepthScores, depth_scores
 from vestcl.scene.estimators import with_estimates
 

@@ -13,7 +13,8 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
-from vestcl.cli import interrupt, options
+from vestcl import interrupt
+from vestcl.cli import options
 
 #: Exit status of an error that the user can correct.
 REFUSED: Final = 2

@@ -8,10 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from vestcl.evaluation.st_lpips import Option as StLpipsOption
 
@@ -20,27 +16,6 @@ from vestcl.evaluation.st_lpips import Option as StLpipsOption
 class Devices:
     """List the OpenCL devices of this machine."""
 
-    def run(self) -> int:
-        """Print the table."""
-        from vestcl import opencl
-
-        used = opencl.select()
-        table = Table("", "index", box=box.SIMPLE, padding=0)
-        table.add_column("device, platform, driver", overflow="fold")
-        for heading in ("type", "units", "GiB", "local KiB", "float64", "OpenCL"):
-            table.add_column(heading)
-        for info in opencl.devices():
-            table.add_row(
-                *("*" if info == used else "", info.index),
-                Text(f"{info.name}\n{info.platform} {info.driver.split(' / ')[-1]}"),
-                *(info.kind, str(info.compute_units), f"{info.memory_gib:.1f}", f"{info.local_memory_kib:.0f}"),
-                *("yes" if info.float64 else "no", info.version.split()[1]),
-            )
-        console = Console()
-        console.print(table)
-        console.print("* is in use; VESTCL_DEVICE (an index or a part of a name) chooses another")
-        return 0
-
 
 @dataclass(frozen=True)
 class Doctor:
@@ -48,32 +23,6 @@ class Doctor:
 
     timeout: float = 120.0
     """Seconds that a device may take."""
-
-    def run(self) -> int:
-        """Print what works; 0 if vestcl's default device does, else 1."""
-        from vestcl import doctor
-
-        console = Console()
-        with console.status("trying every OpenCL device"):
-            report = doctor.examine(self.timeout)
-        table = Table("", "index", "device, platform", *doctor.STEPS, box=box.SIMPLE, padding=0)
-        for device in report.devices:
-            marks = {step.name: "[green]yes[/]" if step.passed else "[red]no[/]" for step in device.steps}
-            used = "*" if device.info.index == report.default else ""
-            name = Text(f"{device.info.name}\n{device.info.platform}")
-            table.add_row(used, device.info.index, name, *(marks.get(step, "-") for step in doctor.STEPS))
-        if report.devices:
-            console.print(table)
-        for device in report.devices:
-            for note in device.notes:
-                console.print(Text(f"{device.info.index} {note}"), soft_wrap=True)
-        for note in report.notes:
-            console.print(Text(note), soft_wrap=True)
-        console.print("[green]vestcl's device works[/]" if report.works else "[red]vestcl's device does not work[/]")
-        others = [device.info.index for device in report.devices if device.works]
-        if others and not report.works:
-            console.print(f"another one does: VESTCL_DEVICE={others[0]}")
-        return 0 if report.works else 1
 
 
 @dataclass(frozen=True)
@@ -95,18 +44,44 @@ class Demo:
     device: str | None = None
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
 
-    def run(self) -> int:
-        """Write the pictures."""
-        from vestcl import opencl
-        from vestcl.cli import demo
 
-        with opencl.use(self.device):
-            demo.run(self.out, self.height, self.width, self.seed, self.model, self.quality)
-        return 0
+@dataclass(frozen=True, kw_only=True)
+class ClipOptions:
+    """How a clip is opened, and where depth, classes and the hidden background of its frames come from."""
+
+    fov: float | None = None
+    """Horizontal field of view in degrees, of a video or a folder without camera.json."""
+    depth: Path | None = None
+    """Folder of depth files (.png, .exr, .npy) with the frames' names."""
+    depth_scale: float | None = None
+    """Their units per metre; PNG needs it (KITTI 256)."""
+    labels: Path | None = None
+    """Folder of label PNGs with the frames' names."""
+    label_ids: Literal["trainIds", "labelIds", "virtual_kitti"] = "trainIds"
+    """What they hold."""
+    depth_model: str | None = None
+    """Estimate depth by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
+    huggingface.co."""
+    mask_model: str | None = None
+    """Estimate classes by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
+    huggingface.co."""
+    inpaint: str | None = None
+    """How the background behind the foreground is filled: regions, telea ..., or lama:FILE, LaMa's TorchScript export.
+    Without it: regions."""
+    rig: str | None = None
+    """KITTI: colour or grey cameras."""
+    accumulated_depth: bool = False
+    """KITTI raw: depth from proj_depth/groundtruth, which has the scans of later frames, too."""
+    sequence: str | None = None
+    """KITTI odometry: which one, if there are several."""
+    snippet: str | None = None
+    """Cityscapes: name of the annotated frame, if there are several."""
+    variant: str | None = None
+    """Virtual KITTI: clone, fog ..., if there are several."""
 
 
 @dataclass(frozen=True)
-class Forecast:
+class Forecast(ClipOptions):
     """Forecast the next frames of a driving clip, and show them from other cameras.
 
     The folder OUT gets pictures, OpenEXR and a video of each view, and forecast.json.
@@ -153,38 +128,9 @@ class Forecast:
     """Pixels; without it as the clip is, or in proportion to --width."""
     width: int | None = None
     """Pixels; without it as the clip is, or in proportion to --height."""
-    fov: float | None = None
-    """Horizontal field of view in degrees, of a video or a folder without camera.json."""
-    depth: Path | None = None
-    """Folder of depth files (.png, .exr, .npy) with the frames' names."""
-    depth_scale: float | None = None
-    """Their units per metre; PNG needs it (KITTI 256)."""
-    labels: Path | None = None
-    """Folder of label PNGs with the frames' names."""
-    label_ids: Literal["trainIds", "labelIds", "virtual_kitti"] = "trainIds"
-    """What they hold."""
-    depth_model: str | None = None
-    """Estimate depth by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
-    huggingface.co."""
-    mask_model: str | None = None
-    """Estimate classes by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
-    huggingface.co."""
-    inpaint: str | None = None
-    """How the background behind the foreground is filled: regions, telea ..., or lama:FILE, LaMa's TorchScript export.
-    Without it: regions."""
     memory: int | None = None
     """Frames before t-1 whose static scene is shown where frames t and t-1 leave something open; 0 shows none. Of the
     geometric forecast only. Without it: 3."""
-    rig: str | None = None
-    """KITTI: colour or grey cameras."""
-    accumulated_depth: bool = False
-    """KITTI raw: depth from proj_depth/groundtruth, which has the scans of later frames, too."""
-    sequence: str | None = None
-    """KITTI odometry: which one, if there are several."""
-    snippet: str | None = None
-    """Cityscapes: name of the annotated frame, if there are several."""
-    variant: str | None = None
-    """Virtual KITTI: clone, fog ..., if there are several."""
     gif: bool = False
     """Write an animated GIF of each view, too."""
     exr: bool = True
@@ -192,16 +138,9 @@ class Forecast:
     device: str | None = None
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
 
-    def run(self) -> int:
-        """Forecast and write."""
-        from vestcl.cli import forecast as forecast_command
-
-        forecast_command.run(self)
-        return 0
-
 
 @dataclass(frozen=True)
-class Prepare:
+class Prepare(ClipOptions):
     """Compute depth, masks, inpainting and motion of clips' frames once, for training, evaluation and forecasts.
 
     Frames that are there, of the same input, are kept; it may be stopped at any moment, and run twice at once.
@@ -236,42 +175,6 @@ class Prepare:
     """I/N, I from 0: every N-th clip from the I-th on. Without it what torchrun tells, if it started this."""
     workers: int = 1
     """Processes."""
-    fov: float | None = None
-    """Horizontal field of view in degrees, of a video or a folder without camera.json."""
-    depth: Path | None = None
-    """Folder of depth files (.png, .exr, .npy) with the frames' names."""
-    depth_scale: float | None = None
-    """Their units per metre; PNG needs it (KITTI 256)."""
-    labels: Path | None = None
-    """Folder of label PNGs with the frames' names."""
-    label_ids: Literal["trainIds", "labelIds", "virtual_kitti"] = "trainIds"
-    """What they hold."""
-    depth_model: str | None = None
-    """Estimate depth by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
-    huggingface.co."""
-    mask_model: str | None = None
-    """Estimate classes by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
-    huggingface.co."""
-    inpaint: str | None = None
-    """How the background behind the foreground is filled: regions, telea ..., or lama:FILE, LaMa's TorchScript export.
-    Without it: regions."""
-    rig: str | None = None
-    """KITTI: colour or grey cameras."""
-    accumulated_depth: bool = False
-    """KITTI raw: depth from proj_depth/groundtruth, which has the scans of later frames, too."""
-    sequence: str | None = None
-    """KITTI odometry: which one, if there are several."""
-    snippet: str | None = None
-    """Cityscapes: name of the annotated frame, if there are several."""
-    variant: str | None = None
-    """Virtual KITTI: clone, fog ..., if there are several."""
-
-    def run(self) -> int:
-        """Fill the cache."""
-        from vestcl.cli import prepare as prepare_command
-
-        prepare_command.run(self)
-        return 0
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip
 from vestcl.evaluation import metrics
 from vestcl.evaluation.compare import FORECAST
@@ -28,6 +28,7 @@ from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.geometric.forecast import METHOD as GEOMETRIC
 from vestcl.forecasting.network import forecast as network
 from vestcl.forecasting.result import Forecast, View
+from vestcl.forecasting.sheets import forecast_sheet
 from vestcl.forecasting.views import parse_views
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.contact_sheet import Cell
@@ -83,7 +84,7 @@ def run(
     name = model or (NETWORK if NETWORK in pretrained.shipped() else GEOMETRIC)
     forecaster = None if name == GEOMETRIC else quality.load(name, level)
     console, street = Console(), Street.generate(seed)
-    clip = street.clip(CONTEXT + steps, height, width, start=START, fps=FPS, samples=SAMPLES)
+    clip = street_clip(street, CONTEXT + steps, height, width, start=START, fps=FPS, samples=SAMPLES)
     seen, index = stereo_only(clip), CONTEXT - 1
     views = parse_views(VIEWS, clip[index])
     with console.status("forecasting") as status:
@@ -94,7 +95,7 @@ def run(
         truth = {view.name: [true_image(street, clip, index + k, view) for k in range(1, steps + 1)] for view in views}
         status.update("writing")
         scores = {view.name: _scores(forecasts, truth[view.name], clip, index, view) for view in views}
-        sheets = {view.name: sheet.forecast_sheet([frame[view.name] for frame in forecast.frames]) for view in views}
+        sheets = {view.name: forecast_sheet([frame[view.name] for frame in forecast.frames]) for view in views}
         settings: dict[str, Any] = {"height": height, "width": width, "model": name}
         if forecaster is not None:
             settings |= {"mode": forecaster.config.default_mode, **pretrained.about_model(name), **quality.about(level)}

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 from rich import box
 from rich.console import Console
@@ -16,31 +16,27 @@ from rich.table import Table
 from rich.text import Text
 
 from vestcl import opencl
-from vestcl.cli.options import check_pixels
+from vestcl.cli import checks, commands
+from vestcl.cli.clip import load_estimators, open_clip
 from vestcl.cli.progress import Bar
-from vestcl.data.later_frames import ClassesOf, DepthOf, LaterFrames, later_frames
-from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
-from vestcl.data.street import input as street_input
 from vestcl.evaluation import compare
 from vestcl.evaluation.compare import Comparison
 from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.trunks.trunks import load_trunk
-from vestcl.forecasting import checks as forecast_checks
 from vestcl.forecasting import files as forecast_files
+from vestcl.forecasting.network.later_frames import LaterFrames, later_frames
 from vestcl.forecasting.result import Forecast, Skipped, View
+from vestcl.forecasting.sheets import forecast_sheet
 from vestcl.forecasting.views import parse_views
-from vestcl.io import contact_sheet as sheet
 from vestcl.models.inference import pretrained, quality
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 
 if TYPE_CHECKING:
-    from vestcl.cli import main as cli
     from vestcl.models.forecaster import Forecaster
 
-#: Frames of a street up to the current one where ``frame`` is not told, and its size in pixels: SPEC section 10.
+#: Frames of a street up to the current one where no frame is asked for: SPEC section 10.
 STREET_CONTEXT: Final = 4
-STREET_SIZE: Final = (256, 832)
 
 #: Frames of a street that is made for one forecast: a quarter of an hour.
 MOST_STREET_FRAMES: Final = 10_000
@@ -50,12 +46,6 @@ STEPS_SHOWN: Final = 5
 
 #: Of ``learned``.
 DEFAULT_LEARNED: Final = "tested"
-
-#: Options that are passed on to the clip's reader, which knows whether it has them.
-_LAYOUT: Final = ("fov", "rig", "sequence", "snippet", "variant", "accumulated_depth")
-
-#: Options of files beside a clip, with what they are if not given.
-_BESIDE: Final = {"depth": None, "depth_scale": None, "labels": None, "label_ids": "trainIds"}
 
 
 @dataclass
@@ -81,14 +71,14 @@ class _Stages:
         self.bar.update(self.task, description=name, completed=share)
 
 
-def run(options: "cli.Forecast") -> None:
+def run(options: commands.Forecast) -> None:
     """Do what the options ask for.
 
     Raises:
         ValueError: an option out of range, or a file that is missing or malformed; the message names it.
         DeviceError: no such OpenCL device.
     """
-    forecast_checks.check(options)
+    checks.check(options)
     console = Console()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     bar = Bar(*columns, console=console, transient=True, disable=not console.is_terminal)
@@ -99,12 +89,13 @@ def run(options: "cli.Forecast") -> None:
             model = None if options.model is None else quality.load(options.model, level)
             estimators = load_estimators(options.depth_model, options.mask_model)
             inpaint = None if options.inpaint is None else inpainter(options.inpaint, "inpaint")
-            clip = open_clip(options, estimators)
+            size = options.height, options.width
+            clip = open_clip(options.input, options, size, _street_frames(options), estimators)
             chosen = options.mode, options.perceive, *estimators, inpaint
             later = None if model is None else later_frames(model.config, *chosen)
             index = current_frame(clip, options)
             views = parse_views(options.view or ("source",), clip[index])
-            forecast_checks.check_memory(options, clip, len(views))
+            checks.check_memory(options, clip, len(views))
             trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
             st_lpips = None if options.st_lpips is None else StLpips.load(options.st_lpips)
         forecast = _forecast(clip, index, options, views, stages, inpaint, model, later)
@@ -129,40 +120,16 @@ def run(options: "cli.Forecast") -> None:
     _print_end(console, forecast_files.read_forecast(options.out))
 
 
-class Estimators(NamedTuple):
-    """What estimates depth and classes of a frame; None where nothing is to."""
-
-    depth: DepthOf | None
-    segmentation: ClassesOf | None
-
-
-def open_clip(options: "cli.Forecast", estimators: Estimators | None = None) -> Clip:
-    """The clip that the options name, at the size they give, with estimators in place of what they replace.
-
-    Args:
-        options: of the command.
-        estimators: of the same options; None loads them.
-
-    Raises:
-        ValueError: as `vestcl.data.open.open_sequence`; an option that a street does not have; an estimator whose
-            package or checkpoint is not there.
-    """
-    forecast_checks.check_input(options.input)
-    estimators = estimators or load_estimators(options.depth_model, options.mask_model)
-    street = forecast_checks.one_street(options.input)
-    beside = {name: getattr(options, name) for name in _BESIDE}
-    layout = {name: getattr(options, name) for name in _LAYOUT if getattr(options, name) not in (None, False)}
-    if street is not None and street.seeds is not None:
-        wrong = [*layout, *(name for name, unset in _BESIDE.items() if beside[name] != unset)]
-        if wrong:
-            raise ValueError(f"{options.input}: is a street, which takes height, width, not {', '.join(wrong)}")
-        return with_estimates(_street(street.seeds[0], street.driven, options), estimators)
-    forecast_checks.check_folders(options)
-    clip = _resized(open_sequence(options.input, **beside, **layout), options.height, options.width)
-    return with_estimates(clip, estimators)
+def _street_frames(options: commands.Forecast) -> int:
+    """Frames of a street that the forecast takes, seen ones and true ones; other clips have theirs."""
+    current = STREET_CONTEXT - 1 if options.frame is None else options.frame
+    frames = current + 1 + (options.steps if options.compare else 0)
+    if frames > MOST_STREET_FRAMES and checks.one_street(options.input) is not None:
+        raise ValueError(f"`frame` must be below {MOST_STREET_FRAMES:,} in a street, got {current}")
+    return max(frames, 1)
 
 
-def current_frame(clip: Clip, options: "cli.Forecast") -> int:
+def current_frame(clip: Clip, options: commands.Forecast) -> int:
     """The index t of the last frame that the forecast may see.
 
     Without ``frame`` the clip's last one; to compare, the last one with a true frame at each of ``steps`` intervals
@@ -189,72 +156,10 @@ def current_frame(clip: Clip, options: "cli.Forecast") -> int:
     return index
 
 
-def _street(seed: int, driven: street_input.Driven, options: "cli.Forecast") -> Clip:
-    if driven.depth or driven.masks:
-        raise ValueError(f"{options.input}: must have no depth and masks here; `vestcl prepare` takes them")
-    current = STREET_CONTEXT - 1 if options.frame is None else options.frame
-    frames = current + 1 + (options.steps if options.compare else 0)
-    if frames > MOST_STREET_FRAMES:
-        raise ValueError(f"`frame` must be below {MOST_STREET_FRAMES:,} in a street, got {current}")
-    height, width = (given or usual for given, usual in zip((options.height, options.width), STREET_SIZE, strict=True))
-    made, start = street_input.street(seed, driven)
-    if driven == street_input.USUAL:
-        return made.clip(max(frames, 1), height, width)
-    fps = float(driven.drawn(seed).fps or street_input.USUAL_RATE)
-    return made.clip(max(frames, 1), height, width, start=start, fps=fps)
-
-
-def _resized(clip: Clip, height: int | None, width: int | None) -> Clip:
-    """The clip at another size; a side that is not told follows the other."""
-    if height is None and width is None:
-        return clip
-    sample = clip[0]
-    if height is None and width is not None:
-        height = max(1, round(sample.height * width / sample.width))
-    elif width is None and height is not None:
-        width = max(1, round(sample.width * height / sample.height))
-    assert height is not None and width is not None
-    check_pixels(height, width)
-    return clip.resized(height, width)
-
-
-def load_estimators(depth_model: str | None, mask_model: str | None) -> Estimators:
-    """The estimators that options name: an existing file is an ONNX network, anything else a checkpoint.
-
-    Raises:
-        ValueError: an estimator whose package, file or checkpoint is missing, or a file that is no network.
-    """
-    if depth_model is None and mask_model is None:
-        return Estimators(None, None)
-    from vestcl.scene import estimators
-
-    depth: DepthOf | None = None
-    classes: ClassesOf | None = None
-    try:
-        if depth_model is not None:
-            is_file = forecast_checks.is_network_file("depth_model", depth_model)
-            depth = (estimators.OnnxDepth if is_file else estimators.DepthEstimator).load(depth_model)
-        if mask_model is not None:
-            is_file = forecast_checks.is_network_file("mask_model", mask_model)
-            classes = (estimators.OnnxSegmentation if is_file else estimators.SegmentationEstimator).load(mask_model)
-    except ImportError as error:  # of the optional package; its message names the remedy
-        raise ValueError(str(error)) from error
-    return Estimators(depth, classes)
-
-
-def with_estimates(clip: Clip, given: Estimators) -> Clip:
-    """The clip with what the estimators give in place of its own depth, its own labels, or both."""
-    if given == Estimators(None, None):
-        return clip
-    from vestcl.scene import estimators
-
-    return estimators.with_estimates(clip, depth=given.depth, segmentation=given.segmentation)
-
-
 def _forecast(
     clip: Clip,
     index: int,
-    options: "cli.Forecast",
+    options: commands.Forecast,
     views: list[View],
     stages: _Stages,
     inpaint: Inpainter | None = None,
@@ -308,7 +213,7 @@ def where_another_is_better(comparison: Comparison, method: str, other: str) -> 
 
 
 def _details(
-    options: "cli.Forecast",
+    options: commands.Forecast,
     clip: Clip,
     index: int,
     forecast: Forecast,
@@ -321,7 +226,7 @@ def _details(
     sheets = {
         name: compare.comparison_sheet(compared[name], what + name)
         if name in compared
-        else sheet.forecast_sheet([frame[name] for frame in forecast.frames], what + name)
+        else forecast_sheet([frame[name] for frame in forecast.frames], what + name)
         for name in forecast.frames[0]
     }
     scores = {name: comparison.scores for name, comparison in compared.items()} if options.compare else None

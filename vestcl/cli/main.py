@@ -9,19 +9,37 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
-from vestcl.cli import interrupt
+from vestcl import interrupt
 
 if TYPE_CHECKING:
     from vestcl.cli.commands import Bench, Demo, Devices, Doctor, Forecast, Prepare
 
 __all__ = ["Bench", "Demo", "Devices", "Doctor", "Forecast", "Prepare", "main"]
 
-#: `vestcl bench train-step` is vestcl.bench.network.train_step; its ``main`` takes a TrainStepBench, may return an exit
-#: code.
-_BENCHES: Final = (
-    *("splat", "operators", "pipeline", "train-step", "network"),
-    *("pareto", "stability", "inpaint", "camera", "depth", "forecast", "compare"),
-)
+#: Modules in vestcl.bench: the ``main`` of `vestcl bench train-step`'s takes a TrainStepBench, may return an exit code.
+_BENCHES: Final = {
+    "splat": "splat.bench",
+    "operators": "splat.operators",
+    "pipeline": "pipeline.bench",
+    "train-step": "network.train_step",
+    "network": "network.bench",
+    "pareto": "pareto.bench",
+    "stability": "stability.bench",
+    "inpaint": "forecast.inpaint",
+    "camera": "camera",
+    "depth": "depth",
+    "forecast": "forecast.bench",
+    "compare": "common.compare",
+}
+
+
+#: Of each command the module and its function; it takes the command, and may return an exit code.
+_COMMANDS: Final = {
+    "Forecast": ("vestcl.cli.forecast", "run"),
+    "Prepare": ("vestcl.cli.prepare", "run"),
+    "Devices": ("vestcl.cli.devices", "run"),
+    "Doctor": ("vestcl.cli.devices", "run_doctor"),
+}
 
 
 def __getattr__(name: str) -> Any:
@@ -62,7 +80,23 @@ def _parsed_command(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
     }
     about = "Forecasts of driving video from new views, in OpenCL. `vestcl --version` prints the version."
     command = command_line.subcommand(kinds, "vestcl", arguments, about)
-    return command, command.run
+    return command, lambda: _run(command)
+
+
+def _run(command: Any) -> int:
+    if type(command).__name__ == "Demo":
+        return _run_demo(command)
+    module, function = _COMMANDS[type(command).__name__]
+    return int(getattr(import_module(module), function)(command) or 0)
+
+
+def _run_demo(options: "Demo") -> int:
+    from vestcl import opencl
+    from vestcl.cli import demo
+
+    with opencl.use(options.device):
+        demo.run(options.out, options.height, options.width, options.seed, options.model, options.quality)
+    return 0
 
 
 def _parsed_bench(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
@@ -70,7 +104,7 @@ def _parsed_bench(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
     from vestcl.cli import command_line
 
     names = arguments[1:2]
-    benches = _benches(sorted({*names} & {*_BENCHES}), asked=True) or _benches(_BENCHES, asked=False)
+    benches = _benches(sorted({*names} & {*_BENCHES}), asked=True) or _benches([*_BENCHES], asked=False)
     kinds: dict[str, Callable[..., Any]] = {name: kind for name, (_, kind) in benches.items()}
     config = command_line.subcommand(kinds, "vestcl bench", arguments[1:])
     module = next(module for module, kind in benches.values() if type(config) is kind)
@@ -84,12 +118,12 @@ def _benches(names: Sequence[str], asked: bool) -> dict[str, tuple[ModuleType, t
 
 def _bench_of(name: str, asked: bool) -> tuple[ModuleType, type] | None:
     """None where there is none of that name; one that nobody asked for and that is broken is a warning, no error."""
-    path = f"vestcl.bench.{name.replace('-', '_')}"
+    path = f"vestcl.bench.{_BENCHES[name]}"
     try:
         module = import_module(path)
         return module, getattr(module, f"{name.title().replace('-', '')}Bench")
     except Exception as error:
-        if isinstance(error, ModuleNotFoundError) and error.name == path:
+        if isinstance(error, ModuleNotFoundError) and error.name and f"{path}.".startswith(f"{error.name}."):
             return None
         if asked or interrupt.is_interrupt(error):
             raise

@@ -6,26 +6,24 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from vestcl.cli import interrupt
-from vestcl.cli.forecast import open_clip
+from vestcl import interrupt
+from vestcl.cli.checks import check_file_options, is_network_file
+from vestcl.cli.clip import open_clip
+from vestcl.cli.commands import Prepare
 from vestcl.cli.progress import Bar
-from vestcl.data.inputs import inputs_of
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
-from vestcl.forecasting.checks import check_file_options, is_network_file
 from vestcl.prepare.clip import Outcome, Report, prepare_clip
 from vestcl.prepare.workers import Task, Told, run_tasks
 from vestcl.scene.inpainting.inpainters import LAMA, inpainter
-
-if TYPE_CHECKING:
-    from vestcl.cli import main as cli
+from vestcl.scene.inputs import inputs_of
 
 #: Where a data set's cache is without ``out``: in it, or for a file beside it.
 BESIDE: Final = ".vestcl"
@@ -42,7 +40,7 @@ _READER: Final[Mapping[str, Any]] = {
 }
 
 
-def run(options: "cli.Prepare") -> None:
+def run(options: Prepare) -> None:
     """Do what the options ask for.
 
     A clip that can't be prepared stops none of the others.
@@ -102,7 +100,7 @@ def shard(told: str | None, environment: Mapping[str, str]) -> tuple[int, int]:
     return int(numbers[1]), int(numbers[2])
 
 
-def plan(options: "cli.Prepare", part: int = 0, parts: int = 1) -> list[Task]:
+def plan(options: Prepare, part: int = 0, parts: int = 1) -> list[Task]:
     """The clips of one part, each with its folder.
 
     Args:
@@ -127,18 +125,16 @@ def plan(options: "cli.Prepare", part: int = 0, parts: int = 1) -> list[Task]:
     return list(tasks.values())
 
 
-def open_input(text: str, options: "cli.Prepare") -> Clip:
+def open_input(text: str, options: Prepare) -> Clip:
     """A clip as `vestcl forecast` opens it, or the street of "street:SEED", at the options' size.
 
     Raises:
-        ValueError: as `vestcl.cli.forecast.open_clip`.
+        ValueError: as `vestcl.cli.clip.open_clip`.
     """
     reader = {name: getattr(options, name) for name in _READER}
     street = street_input.parse(text)
     if street is None or street.seeds is None:
-        from vestcl.cli import main as cli
-
-        return open_clip(cli.Forecast(text, height=options.height, width=options.width, **reader))
+        return open_clip(text, options, (options.height, options.width), options.frames)
     if wrong := [name for name, unset in _READER.items() if reader[name] != unset]:
         raise ValueError(f"{text}: is a street, which brings depth and labels; it does not take {', '.join(wrong)}")
     seed, size = street.seeds[0], (options.height, options.width)
@@ -147,14 +143,14 @@ def open_input(text: str, options: "cli.Prepare") -> Clip:
     return street_input.clip(seed, driven, options.frames, size, options.samples, name)
 
 
-def _driven(street: street_input.StreetInput, options: "cli.Prepare") -> street_input.Driven:
+def _driven(street: street_input.StreetInput, options: Prepare) -> street_input.Driven:
     """What the input says of its street, and where it says nothing the options."""
     fps = None if options.street_fps is None else street_input.rate(options.street_fps, "`street_fps`")
     given = street_input.Driven(options.drive, fps, options.street_depth, options.street_masks)
     return street.driven.over(given)
 
 
-def _check(options: "cli.Prepare") -> None:
+def _check(options: Prepare) -> None:
     check_file_options(options)
     if options.frames < 2:
         raise ValueError(f"`frames` must be 2 or more, got {options.frames}")
@@ -168,7 +164,7 @@ def _expanded(text: str) -> list[str]:
     return [text] if streets is None or streets.seeds is None else streets.each()
 
 
-def _cache(text: str, options: "cli.Prepare") -> Path:
+def _cache(text: str, options: Prepare) -> Path:
     if options.out is not None:
         return options.out
     if street_input.parse(text) is not None:
@@ -177,7 +173,7 @@ def _cache(text: str, options: "cli.Prepare") -> Path:
     return (path if path.is_dir() else path.parent) / BESIDE
 
 
-def estimators(options: "cli.Prepare") -> str:
+def estimators(options: Prepare) -> str:
     """A key of the networks that the options name; empty without any."""
     models = (options.depth_model, options.mask_model, *((options.inpaint,) if options.inpaint else ()))
     keys = [*map(identity, models), *([COMBINED] if options.depth_model else [])]
@@ -207,7 +203,7 @@ def _files_of(model: Path) -> list[Path]:
     return sorted(path for path in model.rglob("*") if path.is_file())
 
 
-def _prepare(task: Task, waits: bool, report: Report, options: "cli.Prepare") -> Outcome | None:
+def _prepare(task: Task, waits: bool, report: Report, options: Prepare) -> Outcome | None:
     clip, inpaint = open_input(task.text, options), None
     street, seen = street_input.parse(task.text), clip
     if street is not None and street.seeds is not None:

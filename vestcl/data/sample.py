@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl import geometry
-from vestcl.data import calibration, fit, resize, times
+from vestcl import geometry, times
+from vestcl.data import calibration, fit, resize
 from vestcl.data.sources import (
     DepthArray,
     DepthSource,
@@ -273,7 +273,7 @@ class Clip(Sequence[Sample]):
 
     @functools.cached_property
     def interval(self) -> float | None:
-        """Seconds, the median from frame to frame (`vestcl.data.times.median_interval`); None without timestamps.
+        """Seconds, the median from frame to frame (`vestcl.times.median_interval`); None without timestamps.
 
         Raises:
             ValueError: timestamps that do not increase; the message names the frames.
@@ -300,7 +300,7 @@ class Clip(Sequence[Sample]):
         return float(self.positions[index] - self.positions[index - 1]) if index else 1.0
 
     def after(self, index: int, steps: int) -> list[int]:
-        """The frames at t + 1, t + 2, ... intervals, see `vestcl.data.times.frames_after`.
+        """The frames at t + 1, t + 2, ... intervals, see `vestcl.times.frames_after`.
 
         Args:
             index: of the frame t.

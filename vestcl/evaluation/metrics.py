@@ -9,7 +9,7 @@ from typing import Final, Literal, NamedTuple
 import torch
 from torch.nn import functional
 
-from vestcl.models.networks.layers import check
+from vestcl.shapes import check
 
 #: Side of SSIM's window in pixels, and the standard deviation of its Gaussian (Wang et al. 2004).
 WINDOW: Final = 11

@@ -15,8 +15,8 @@ from torch import nn
 from vestcl.evaluation.st_lpips import INSTALLED, REMEDY, find_weights
 from vestcl.evaluation.trunks.shift_tolerant import ShiftTolerantTrunk, load_shift_tolerant
 from vestcl.evaluation.trunks.trunks import Normalisation, Trunk, load_trunk
-from vestcl.models.networks.layers import check
 from vestcl.models.weights_file import check_finite, read_state_dict
+from vestcl.shapes import check
 
 #: LPIPS's own scaling layer, after 2 x - 1: ImageNet's mean and deviation on [-1, 1], in three digits.
 LPIPS_SCALING: Final = Normalisation((-0.030, -0.088, -0.188), (0.458, 0.448, 0.450), gain=2.0, offset=-1.0)
@@ -57,7 +57,7 @@ class _LearntDistance(nn.Module):
         """
         maps = _both(self.trunk, prediction, target)
         layers = [
-            torch.einsum("bchw,c->bhw", _squared_difference(*pair), head).mean(dim=(1, 2))
+            torch.einsum("bchw,c->bhw", squared_difference(*pair), head).mean(dim=(1, 2))
             for pair, head in zip(maps, self.heads, strict=True)
         ]
         return torch.stack(layers).sum(dim=0)
@@ -154,7 +154,7 @@ def squeeze_distance(prediction: torch.Tensor, target: torch.Tensor, trunk: Trun
     """
     if trunk.name != "squeezenet1_0":
         raise ValueError(f"`trunk` must be squeezenet1_0, got {trunk.name}")
-    layers = [_squared_difference(*pair).sum(dim=1).mean(dim=(1, 2)) for pair in _both(trunk, prediction, target)]
+    layers = [squared_difference(*pair).sum(dim=1).mean(dim=(1, 2)) for pair in _both(trunk, prediction, target)]
     return torch.stack(layers).sum(dim=0)
 
 
@@ -206,7 +206,7 @@ def _both(
     return list(zip(trunk(prediction), trunk(target), strict=True))
 
 
-def _squared_difference(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+def squared_difference(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     """(f / |f| - g / |g|)^2 with the norms over channels: [B, C, H, W]."""
     # vector_norm has gradient 0 at 0, where the square root of a sum of squares would give NaN.
     unit = [f / (torch.linalg.vector_norm(f, dim=1, keepdim=True) + _EPSILON) for f in (first, second)]

@@ -14,7 +14,7 @@ from vestcl.data.resize import resize_image
 from vestcl.data.sample import Clip
 from vestcl.evaluation import metrics
 from vestcl.evaluation.border import blacken_border
-from vestcl.evaluation.perceptual import Lpips, StLpips, _squared_difference
+from vestcl.evaluation.perceptual import Lpips, StLpips, squared_difference
 from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecasting import baselines
 from vestcl.forecasting.result import Forecast, View
@@ -314,7 +314,7 @@ def distance(
         wanted: the same of the truth.
         heads: [C_l] a layer.
     """
-    squares = [_squared_difference(f, g) for f, g in zip(maps, wanted, strict=True)]
+    squares = [squared_difference(f, g) for f, g in zip(maps, wanted, strict=True)]
     if heads is None:
         layers = [square.sum(dim=1) for square in squares]
     else:

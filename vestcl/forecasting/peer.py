@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from vestcl.data.sample import Clip, Sample
-from vestcl.data.times import is_same
 from vestcl.forecasting.geometric import Perception, show_frame
 from vestcl.forecasting.geometric import forecast_frames as geometric_frames
 from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.models.networks.voxel_flow import MULTIPLE, VoxelFlowNetwork
+from vestcl.times import is_same
 
 #: The name of this method in tables and files.
 METHOD: Final = "DMVFN shape"

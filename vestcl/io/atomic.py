@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from vestcl.cli import interrupt
+from vestcl import interrupt
 
 #: Bytes of the largest file that is read whole: 16,384 x 8,192 pixels in float64.
 LARGEST: Final = 1 << 30

@@ -27,7 +27,7 @@ from types import MappingProxyType
 from typing import Final, Literal, get_args
 
 from vestcl import constants
-from vestcl.data.times import is_same
+from vestcl.times import is_same
 
 Mode = Literal["feedback", "compose"]
 """How frames after the first are forecast; see `vestcl.models.forecaster.Forecaster.forecast`."""

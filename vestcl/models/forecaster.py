@@ -9,7 +9,6 @@ import torch
 from vestcl.models.checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models.config import Mode
 from vestcl.models.inference.skipping import current_tally
-from vestcl.models.networks.layers import check
 from vestcl.models.stages import Stages
 from vestcl.models.steps.clouds import Cloud, advance
 from vestcl.models.steps.frames import check_frames
@@ -19,6 +18,7 @@ from vestcl.models.steps.prior import MotionPrior, check_prior
 from vestcl.models.steps.render import Camera, RenderedView, checked_camera
 from vestcl.models.weights_file import misfit
 from vestcl.scene.layers import LayerBatch
+from vestcl.shapes import check
 
 __all__ = [
     "Camera",

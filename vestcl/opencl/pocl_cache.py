@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from vestcl.cli import interrupt
+from vestcl import interrupt
 
 #: The environment variable that names PoCL's cache.
 VARIABLE: Final = "POCL_CACHE_DIR"

@@ -16,14 +16,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.data.inputs import Inputs
 from vestcl.data.sample import Clip, Sample
 from vestcl.io.atomic import read_bytes
 from vestcl.io.images import to_float, to_pixels
 from vestcl.io.video.reading import Video
 from vestcl.prepare.files import JSON, RECIPE, Shape, frame_path, restore_frame, write_clip, write_frame
-from vestcl.prepare.prepared import prepare_frame
+from vestcl.prepare.frame import prepare_frame
 from vestcl.scene.inpainting.inpainters import Inpainter
+from vestcl.scene.inputs import Inputs
 from vestcl.scene.perception import Perception
 
 #: Frames before it that perception looks at: depth from motion sees three, and the frame before has to have it, too.

@@ -19,20 +19,18 @@ import json
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from vestcl.data.inputs import Inputs, inputs_of
 from vestcl.data.sample import Clip, Sample
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.io.images import to_pixels
-
-if TYPE_CHECKING:
-    from vestcl.prepare.prepared import Prepared
+from vestcl.prepare.frame import Prepared
+from vestcl.scene.inputs import Inputs, inputs_of
 
 #: Raised when perception, the procedural street or these files change: it makes every frame be computed anew.
 RECIPE: Final = "vestcl prepared 4"
@@ -72,7 +70,7 @@ def frame_path(folder: Path, index: int) -> Path:
     return folder / f"{index:06}.safetensors"
 
 
-def write_frame(folder: Path, index: int, key: str, frame: "Prepared", right: NDArray[np.float32] | None) -> None:
+def write_frame(folder: Path, index: int, key: str, frame: Prepared, right: NDArray[np.float32] | None) -> None:
     """Replace a frame's file in one step.
 
     Args:
@@ -182,7 +180,7 @@ def _facts(sample: Sample, key: str) -> dict[str, Any]:
     }
 
 
-def _packed(frame: "Prepared", right: NDArray[np.float32] | None) -> dict[str, Array]:
+def _packed(frame: Prepared, right: NDArray[np.float32] | None) -> dict[str, Array]:
     layers, hidden, velocity = frame.layers, ~frame.layers.mask[0], frame.velocity.astype(np.float16)
     moving = (velocity != 0).any(0)
     tensors: dict[str, Array] = {

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip, RightCamera, Sample
-from vestcl.prepare.prepared import Prepared, PreparedClip
+from vestcl.prepare.frame import Prepared
+from vestcl.prepare.prepared import PreparedClip
 from vestcl.scene.inpainting.inpainters import Inpainter
 from vestcl.scene.motion import objects
 from vestcl.scene.perception import Moving, Perception, Seen, Surface

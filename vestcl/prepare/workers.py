@@ -14,7 +14,7 @@ from typing import Final
 import cv2
 import torch
 
-from vestcl.cli import interrupt
+from vestcl import interrupt
 from vestcl.prepare.clip import Outcome, Report
 
 #: Seconds between two looks at what other processes tell.

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.constants import SKY_DEPTH
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.depth.completion import complete_depth
 from vestcl.scene.inpainting.inpaint import inpaint_background
 from vestcl.scene.inpainting.inpainters import Inpainter
@@ -71,8 +71,8 @@ def build_layers(
 
     Source: SPEC section 3.
     """
-    image = _check.planes("image", image, 3)
-    mask = _check.mask("mask", mask, image)
+    image = checked.planes("image", image, 3)
+    mask = checked.mask("mask", mask, image)
     complete = without_gaps(image, depth, sky)
     background_image, background_depth = inpaint_background(image, complete, mask, method=inpaint)
     return Layers(image, complete, mask, background_image, background_depth)
@@ -83,9 +83,9 @@ def without_gaps(image: ArrayLike, depth: ArrayLike, sky: ArrayLike | None = Non
 
     Args and raises as there.
     """
-    image = _check.planes("image", image, 3)
-    depth = _check.depth("depth", depth, image)
-    far = depth >= SKY_DEPTH if sky is None else _check.mask("sky", sky, image)
+    image = checked.planes("image", image, 3)
+    depth = checked.depth("depth", depth, image)
+    far = depth >= SKY_DEPTH if sky is None else checked.mask("sky", sky, image)
     known = np.where(far, np.float32(0), depth)
     if not (known > 0).any() and not far.all():
         raise ValueError("`depth` must have a valid pixel outside the sky, got none")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from skimage.segmentation import slic
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 
 #: Superpixels are found in images of at most that width, which takes a few ms, and enlarged.
 _WIDTH: Final = 208
@@ -38,8 +38,8 @@ def superpixels(image: ArrayLike, depth: ArrayLike, *, area: float = 100.0) -> N
 
     Source: Achanta et al., SLIC Superpixels Compared to State-of-the-Art Superpixel Methods, 2012, by scikit-image.
     """
-    image = _check.planes("image", image, 3)
-    depth = _check.depth("depth", depth, image)
+    image = checked.planes("image", image, 3)
+    depth = checked.depth("depth", depth, image)
     if not depth.all():
         raise ValueError(f"`depth` must be above 0 m everywhere, got {int((depth == 0).sum())} pixels of 0")
     if not area >= 1:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 
 #: Sky is smoother than that after a blur of 1 px: grey levels (0 to 1) a pixel ...
 _SMOOTH: Final = 0.012
@@ -60,8 +60,8 @@ def sky_mask(image: ArrayLike, depth: ArrayLike | None = None, *, matched: bool 
     Raises:
         ValueError: shapes or numbers that aren't finite.
     """
-    image = _check.planes("image", image, 3)
-    metres = np.zeros(image.shape[1:], np.float32) if depth is None else _check.planes("depth", depth, 1, image)[0]
+    image = checked.planes("image", image, 3)
+    metres = np.zeros(image.shape[1:], np.float32) if depth is None else checked.planes("depth", depth, 1, image)[0]
     grey = np.asarray(cv2.cvtColor(image.transpose(1, 2, 0), cv2.COLOR_RGB2GRAY), np.float32)
     blurred = cv2.GaussianBlur(grey, (0, 0), 1.0)
     right, down = (np.asarray(cv2.Sobel(blurred, cv2.CV_32F, *order), np.float32) for order in ((1, 0), (0, 1)))

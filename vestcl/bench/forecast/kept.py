@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import vestcl
 from vestcl.bench.forecast.truth import Facts
-from vestcl.evaluation import Record
+from vestcl.evaluation.scores import Record
 
 Window = tuple[list[Record], list[Facts]]
 

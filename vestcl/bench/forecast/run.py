@@ -14,16 +14,16 @@ from vestcl.bench.forecast.config import HELD_OUT, ForecastBench
 from vestcl.bench.forecast.kept import SUFFIX, Kept, Window
 from vestcl.bench.forecast.truth import Facts
 from vestcl.bench.forecast.windows_list import Listed, read_list
-from vestcl.cli.forecast import load_estimators, with_estimates
+from vestcl.cli.checks import check_input
+from vestcl.cli.clip import load_estimators, with_estimates
 from vestcl.cli.progress import Bar
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
-from vestcl.evaluation import SOURCE, Record, Truth
 from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.regions import error_shares
+from vestcl.evaluation.scores import SOURCE, Record, Truth
 from vestcl.evaluation.trunks.trunks import Trunk
-from vestcl.forecasting.checks import check_input
 from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.result import View
 from vestcl.forecasting.views import parse_views

@@ -4,10 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from vestcl.bench.forecast.truth import Facts
-from vestcl.evaluation import (
+from vestcl.evaluation.regions import REGIONS
+from vestcl.evaluation.scores import Record
+from vestcl.evaluation.statistics import interval_grid
+from vestcl.evaluation.tables import (
     METRICS,
     Grid,
-    Record,
     by_method,
     by_view,
     finite,
@@ -20,8 +22,6 @@ from vestcl.evaluation import (
     to_markdown,
     to_rich,
 )
-from vestcl.evaluation.regions import REGIONS
-from vestcl.evaluation.statistics import interval_grid
 
 __all__ = [
     "Grid",

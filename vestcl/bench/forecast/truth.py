@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.street.clip import Shot, StreetImage
-from vestcl.evaluation import ego_errors, metrics, true_motion
+from vestcl.evaluation import metrics
+from vestcl.evaluation.motion import ego_errors, true_motion
 from vestcl.forecasting.geometric.render import Cloud, show
 from vestcl.forecasting.result import Forecast
 from vestcl.io.labels import SKY, background

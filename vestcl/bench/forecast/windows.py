@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.evaluation import GEOMETRIC, ORACLE, SOURCE, Prediction, Predictions, Record, Truth, look, score
-from vestcl.evaluation import predictions as all_predictions
 from vestcl.evaluation.methods import TRUE_POSES, Method, forecasts_of
+from vestcl.evaluation.scores import GEOMETRIC, ORACLE, SOURCE, Prediction, Predictions, Record, Truth, look, score
 from vestcl.evaluation.scores import distance as _distance
+from vestcl.evaluation.scores import predictions as all_predictions
 from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.network import forecast as network
 from vestcl.forecasting.result import Forecast, View

@@ -7,12 +7,12 @@ import torch
 from torch.nn import functional
 
 from vestcl import geometry
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.network.input import NetworkInput, last_motions, network_input
 from vestcl.models.inference.effort import enlarged, fraction, reduced
 from vestcl.models.networks.layers import mapped
-from vestcl.prepare.prepared import prepare_frame
+from vestcl.prepare.frame import prepare_frame
 from vestcl.scene.layers import LayerBatch
 
 #: The current frame t: t - 2 and t - 1 before it tell how the camera's motion changes.
@@ -49,7 +49,7 @@ def scene(seed: int, height: int, width: int, steps: int) -> Scene:
         width: columns, px.
         steps: frames after t.
     """
-    clip = Street.generate(seed).clip(CURRENT + 1 + steps, height, width, start=START, samples=SAMPLES)
+    clip = street_clip(Street.generate(seed), CURRENT + 1 + steps, height, width, start=START, samples=SAMPLES)
     perception = Perception(clip)
     prev, cur = (prepare_frame(perception, index) for index in (CURRENT - 1, CURRENT))
     frames = [torch.from_numpy(clip[CURRENT + step].read_image()) for step in range(1, steps + 1)]

@@ -18,11 +18,11 @@ from typing import Final
 import numpy as np
 import torch
 
-from vestcl.data import Street
+from vestcl.data import Street, street_clip
 from vestcl.data.street.driving.drive import MAX_CHANGE, Sway
 from vestcl.forecasting.network.input import NetworkInput, last_motions, network_input
 from vestcl.models.steps.prior import nothing_moves
-from vestcl.prepare.prepared import Prepared, prepare_frame
+from vestcl.prepare.frame import Prepared, prepare_frame
 from vestcl.scene.layers import LayerBatch
 from vestcl.scene.perception import Perception
 
@@ -117,7 +117,7 @@ def street(name: str, seed: int) -> Street:
 
 
 def _prepared(name: str, height: int, width: int, frames: int, seed: int) -> Iterator[Prepared]:
-    clip = street(name, seed).clip(frames, height, width, foreground=name != EMPTY)
+    clip = street_clip(street(name, seed), frames, height, width, foreground=name != EMPTY)
     perception = Perception(clip)
     return (prepare_frame(perception, index) for index in range(frames))
 

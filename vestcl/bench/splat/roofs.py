@@ -1,7 +1,8 @@
 """Each splat kernel beside the roofs of its device.
 
 A kernel that moves b bytes and computes f flops takes at least max(b / bandwidth, f / peak). Both roofs are measured in
-turns with the kernels: a copy past the cache, and chains of multiply-adds, both in OpenCL (kernels/splat/splat_roofline.cl).
+turns with the kernels: a copy past the cache, and chains of multiply-adds, both in OpenCL
+(kernels/splat/splat_roofline.cl).
 """
 
 import statistics

@@ -8,7 +8,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from vestcl.data import times
+from vestcl import times
 from vestcl.data.calibration import Matrix, check_intrinsics, check_rigid, rigid, split_projection
 from vestcl.io.atomic import read_bytes
 

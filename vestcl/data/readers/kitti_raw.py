@@ -13,7 +13,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.data import calibration, fit, times
+from vestcl import times
+from vestcl.data import calibration, fit
 from vestcl.data.calibration import Matrix
 from vestcl.data.readers import files
 from vestcl.data.readers.files import Calibration

@@ -91,10 +91,11 @@ class StreetLabels:
         return self.shot.take().labels[0].copy()
 
 
-def clip(
+def street_clip(
     street: Street,
     frames: int,
-    size: tuple[int, int],
+    height: int,
+    width: int,
     *,
     start: float = 0.0,
     fps: float = 10.0,
@@ -111,7 +112,8 @@ def clip(
     Args:
         street: where.
         frames: how many, 1 or more.
-        size: (height, width) of the pictures in pixels.
+        height: of the images, px.
+        width: alike.
         start: seconds.
         fps: frames a second.
         baseline: metres from the left camera to the right one.
@@ -121,7 +123,7 @@ def clip(
     Raises:
         ValueError: a number that is not positive, or not finite; the message names it.
     """
-    check_size(*size)
+    check_size(height, width)
     check_samples(samples)
     if not isinstance(frames, int | np.integer) or frames < 1:
         raise ValueError(f"`frames` must be a positive integer, got {frames!r}")
@@ -130,7 +132,7 @@ def clip(
             raise ValueError(f"`{name}` must be positive and finite, got {value!r}")
     if not np.isfinite(start):
         raise ValueError(f"`start` must be finite, got {start!r}")
-    first = Shot(street, float(start), 0.0, (int(size[0]), int(size[1])), int(samples), bool(foreground))
+    first = Shot(street, float(start), 0.0, (int(height), int(width)), int(samples), bool(foreground))
     taken = [_sample(replace(first, t=start + i / fps), i, baseline) for i in range(frames)]
     return Clip(f"street {street.seed}", "procedural street", tuple(taken))
 

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from vestcl.data import street_clip
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.street.clip import StreetDepth
 from vestcl.data.street.driving.drive import Sway
@@ -145,7 +146,7 @@ def clip(seed: int, driven: Driven, frames: int, size: tuple[int, int], samples:
     driven = driven.drawn(seed)
     made, start = street(seed, driven)
     fps = USUAL_RATE if driven.fps is None else float(driven.fps)
-    plain = made.clip(frames, *size, start=start, samples=samples, fps=fps)
+    plain = street_clip(made, frames, *size, start=start, samples=samples, fps=fps)
     beams = int(np.random.default_rng([seed, _BEAMS]).choice(BEAMS))
     seen = tuple(_seen(sample, index, driven, beams) for index, sample in enumerate(plain))
     return replace(plain, name=f"{plain.name} {name}".rstrip(), samples=seen)

@@ -24,7 +24,7 @@ from vestcl.data.street.layout import BLOCK, CROSSING, Layout
 from vestcl.data.street.raycast import FOREGROUND, SOLID, Frame, Label, Material, Scene, Solids, blank_frame, cast
 
 if TYPE_CHECKING:  # it needs torch, which takes seconds to import
-    from vestcl.data.sample import Clip
+    pass
 
 __all__ = ["Street", "intrinsics"]
 
@@ -193,26 +193,6 @@ class Street:
             moved = self._bent_displacements(cur, names, seen * frame.depth[0, 0][moving], *span)
         displacement[:, moving] += after[:3, :3] @ moved
         return displacement.astype(np.float32)
-
-    def clip(
-        self,
-        frames: int,
-        height: int,
-        width: int,
-        *,
-        start: float = 0.0,
-        fps: float = 10.0,
-        baseline: float = 0.54,
-        samples: int = 1,
-        foreground: bool = True,
-    ) -> "Clip":
-        """A drive down the street as any data set gives it, rendered when it is read; see `street_clip.clip`."""
-        from vestcl.data.street import clip as street_clip
-
-        size = (height, width)
-        return street_clip.clip(
-            self, frames, size, start=start, fps=fps, baseline=baseline, samples=samples, foreground=foreground
-        )
 
     def _displacements(
         self, camera_from_world: NDArray[np.float64], instances: NDArray[np.int32], t_cur: float, t_next: float

@@ -12,8 +12,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from vestcl.models.networks.layers import check
 from vestcl.models.weights_file import check_finite, misfit, read_state_dict
+from vestcl.shapes import check
 
 #: Channels of the five maps, each after a ReLU.
 CHANNELS: Final = (64, 192, 384, 256, 256)

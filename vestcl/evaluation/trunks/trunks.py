@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from vestcl.models.networks.layers import check
 from vestcl.models.weights_file import check_finite, read_state_dict, unwrapped
+from vestcl.shapes import check
 
 
 class Normalisation(NamedTuple):

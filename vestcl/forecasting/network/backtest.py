@@ -21,7 +21,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.data.times import is_same
 from vestcl.forecasting.geometric.forecast import forecast_frames as forecast_geometric
 from vestcl.forecasting.geometric.paths import point_paths
 from vestcl.forecasting.network.learned import (
@@ -46,6 +45,7 @@ from vestcl.scene.depth.road_plane import rays_of
 from vestcl.scene.exposure import curve_by_flow
 from vestcl.scene.flow.correspondence import sample
 from vestcl.scene.perception import Perception
+from vestcl.times import is_same
 
 #: A part must lower the error by this share: of two forecasts that are equally good, chance picks one.
 MARGIN: Final = 0.02

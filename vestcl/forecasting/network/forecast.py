@@ -20,7 +20,7 @@ from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
 from vestcl.models.inference.skipping import Count, Tally, count_skips
 from vestcl.models.inference.stage_times import watching, with_rest
-from vestcl.prepare.prepared import prepare_frame
+from vestcl.prepare.frame import prepare_frame
 from vestcl.scene.inpainting.inpainters import Inpainter
 from vestcl.scene.perception import Perception
 

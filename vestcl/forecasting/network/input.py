@@ -13,8 +13,8 @@ from vestcl import geometry
 from vestcl.models.networks.camera_correction import INTERVAL, MEASURED, rates_of
 from vestcl.models.networks.rigid_motion import RigidMotion
 from vestcl.models.steps.prior import MotionPrior
-from vestcl.prepare.prepared import Prepared
-from vestcl.scene import _check
+from vestcl.prepare.frame import Prepared
+from vestcl.scene import checked
 from vestcl.scene.layers import LayerBatch, batch
 from vestcl.scene.motion.camera_forecast import forecast_camera
 from vestcl.scene.motion.ego_motion import constant_velocity
@@ -81,7 +81,7 @@ def network_input(
         raise ValueError(f"`prev` and `cur` must be of one size, got {sizes[0]} and {sizes[1]}")
     if not np.allclose(prev.K, cur.K):
         raise ValueError(f"`prev` and `cur` must have one K, got {prev.K.tolist()} and {cur.K.tolist()}")
-    motions = [_check.matrix("motions", motion, 4) for motion in motions]
+    motions = [checked.matrix("motions", motion, 4) for motion in motions]
     elapsed = [1.0] * len(motions)
     elapsed[-2:] = [prev.elapsed, cur.elapsed][-len(motions) :]
     next_from_cur = constant_velocity(motions, elapsed) if path is None else path.future_from_cur[0]

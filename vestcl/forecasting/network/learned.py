@@ -21,7 +21,7 @@ from vestcl.forecasting.result import LearnedPart, Rendered, View
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.stage_times import watching
 from vestcl.models.steps.render import looks_of
-from vestcl.prepare.prepared import prepare_frame
+from vestcl.prepare.frame import prepare_frame
 from vestcl.scene.perception import Perception
 
 Learned = Literal["tested", "all"]

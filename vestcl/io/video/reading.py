@@ -9,9 +9,9 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.data.times import median_interval
 from vestcl.io.video.decoder import Decoder
 from vestcl.io.video.packets import list_frames, orientation, oriented
+from vestcl.times import median_interval
 
 #: What a forked child inherits of open videos. Its state is the parent's at any moment, so that it is not even closed.
 _ABANDONED: Final[list[Decoder]] = []

@@ -10,8 +10,9 @@ from torch.nn import functional
 
 from vestcl.models.config import ENCODER_GROUP, EncoderConfig
 from vestcl.models.networks.group_norm import Normalise, own
-from vestcl.models.networks.layers import channels_last, check, group_norm, side_by_side, upsample
+from vestcl.models.networks.layers import channels_last, group_norm, side_by_side, upsample
 from vestcl.models.weights_file import check_finite, read_state_dict, some_of
+from vestcl.shapes import check
 
 #: Pixels of the image a cell of the features, in both directions.
 STRIDE: Final = 4

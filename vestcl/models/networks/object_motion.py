@@ -9,7 +9,8 @@ from torch import nn
 from torch.nn import functional
 
 from vestcl.models.config import ObjectMotionConfig, RoutingConfig
-from vestcl.models.networks.layers import channels_last, check, frame_pair, side_by_side, upsample
+from vestcl.models.networks.layers import channels_last, frame_pair, side_by_side, upsample
+from vestcl.shapes import check
 
 #: Motion of both frames to t + 1: xyz of the previous one, xyz of the current one.
 MOTION_CHANNELS: Final = 6

@@ -16,7 +16,8 @@ from vestcl.models.config import (
     RefineConfig,
     RenderConfig,
 )
-from vestcl.models.networks.layers import channels_last, check, group_norm, side_by_side, upsample
+from vestcl.models.networks.layers import channels_last, group_norm, side_by_side, upsample
+from vestcl.shapes import check
 
 
 class Refine(nn.Module):

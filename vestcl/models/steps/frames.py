@@ -7,8 +7,8 @@ from torch.nn import functional
 
 from vestcl import constants
 from vestcl.models.networks.encoder import STRIDE, upsample_features
-from vestcl.models.networks.layers import check
 from vestcl.scene.layers import LayerBatch
+from vestcl.shapes import check
 
 #: A mask's pixel below is foreground, whatever a resize made of 0 and 1.
 FOREGROUND_BELOW: Final = 0.5

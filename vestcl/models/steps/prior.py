@@ -7,11 +7,11 @@ import torch
 
 from vestcl import geometry
 from vestcl.models.networks.camera_correction import MEASURED, RATES, CameraPrior
-from vestcl.models.networks.layers import check
 from vestcl.models.networks.rigid_motion import RigidMotion
 from vestcl.models.steps.clouds import as_image, as_points
 from vestcl.models.steps.render import RenderedView
 from vestcl.ops.unproject import unproject
+from vestcl.shapes import check
 
 
 class MotionPrior(NamedTuple):

@@ -11,12 +11,13 @@ from vestcl import constants
 from vestcl.constants import SKY_DEPTH
 from vestcl.models.config import LEAST_COVERAGE, RenderConfig
 from vestcl.models.inference.skipping import Tally
-from vestcl.models.networks.layers import check, side_by_side
+from vestcl.models.networks.layers import side_by_side
 from vestcl.models.steps.clouds import Cloud, Grid, last_motion
 from vestcl.ops.displace import displace
 from vestcl.ops.splat import composite, rasterize
 from vestcl.ops.stretch import stretch
 from vestcl.scene.inpainting.holes import deep_holes
+from vestcl.shapes import check
 
 #: Metres that inpainted points go farther back in the splatter's order, where they come last: what a frame has not seen
 #: never hides what it has. An inpainted point stands still 1 % behind the object that hides it, and a car that drives

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.depth.from_motion import CAMERA_HEIGHT, observe
 from vestcl.scene.depth.from_motion_measure import Measured
 from vestcl.scene.depth.road_plane import fit_road
@@ -101,12 +101,12 @@ def combine_depth(
     Raises:
         ValueError: no image, shapes, or numbers that are not finite.
     """
-    depth = _check.depth("estimate", estimate)
+    depth = checked.depth("estimate", estimate)
     if not images:
         raise ValueError("`images` must be one or more, got none")
-    frames = [_check.planes(f"images[{i}]", image, 3, depth) for i, image in enumerate(images)]
-    K = _check.matrix("K", K, 3)
-    still = np.ones_like(depth, bool) if static is None else _check.mask("static", static, depth)
+    frames = [checked.planes(f"images[{i}]", image, 3, depth) for i, image in enumerate(images)]
+    K = checked.matrix("K", K, 3)
+    still = np.ones_like(depth, bool) if static is None else checked.mask("static", static, depth)
     inverse = np.divide(1.0, depth[0], out=np.zeros(depth.shape[1:]), where=depth[0] > 0)
     if len(frames) == 1:
         return CombinedDepth(_depth_of(inverse if metric else _by_road(inverse, K, camera_height)), np.eye(4), None)

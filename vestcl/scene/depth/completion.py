@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 
 #: Strength of the smoother and how much it minds edges of the image (of 255). From 20 to 1000 in strength the forecast
 #: on KITTI odometry loses 1.5 dB at t+1; 2 to 8 in edges makes no difference.
@@ -34,12 +34,12 @@ def complete_depth(depth: ArrayLike, image: ArrayLike) -> NDArray[np.float32]:
 
     Source: Min et al., Fast Global Image Smoothing Based on Weighted Least Squares, 2014.
     """
-    depth = _check.depth("depth", depth)
-    image = _check.planes("image", image, 3, depth)
+    depth = checked.depth("depth", depth)
+    image = checked.planes("image", image, 3, depth)
     known = depth > 0
     if known.all():
         return depth
-    guide = _check.pixels(image)
+    guide = checked.pixels(image)
     inverse = np.divide(1, depth, out=np.zeros_like(depth), where=known)[0]
     share = smooth(guide, known[0].astype(np.float32))
     spread = smooth(guide, inverse) / np.maximum(share, np.float32(1e-12))

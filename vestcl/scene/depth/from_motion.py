@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.constants import SKY_DEPTH
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.depth import from_motion_fill as motion_fill
 from vestcl.scene.depth.from_motion_measure import Measured, measure, moving_by_turn
 from vestcl.scene.depth.road_plane import fit_road, rays_of
@@ -85,7 +85,7 @@ def motion_depth(
     Source: SPEC section 8; Nister, An Efficient Solution to the Five-Point Relative Pose Problem, 2004.
     """
     pictures = _pictures(images)
-    K = _check.matrix("K", K, 3)
+    K = checked.matrix("K", K, 3)
     if not camera_height > 0:
         raise ValueError(f"`camera_height` must be above 0 m, got {camera_height}")
     flow = correspond(pictures[-1], pictures[-2]) if correspondence is None else correspondence
@@ -128,8 +128,8 @@ def observe(
 def _pictures(images: Sequence[ArrayLike]) -> list[NDArray[np.float32]]:
     if len(images) < 2:
         raise ValueError(f"`images` must be two or more, got {len(images)}")
-    first = _check.planes("images[0]", images[0], 3)
-    return [first, *(_check.planes(f"images[{i}]", image, 3, first) for i, image in enumerate(images) if i)]
+    first = checked.planes("images[0]", images[0], 3)
+    return [first, *(checked.planes(f"images[{i}]", image, 3, first) for i, image in enumerate(images) if i)]
 
 
 def _metres(measured: Measured, plane: Array | None, camera_height: float) -> float:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.depth import completion
 from vestcl.scene.morphology import dilated
 from vestcl.scene.motion.mask import without_specks
@@ -157,7 +157,7 @@ def smooth(inverse: Array, confidence: Array, road: Array, image: NDArray[np.flo
 
     Source: Min et al., Fast Global Image Smoothing Based on Weighted Least Squares, 2014.
     """
-    guide, ground = _check.pixels(image), np.maximum(road, 0)
+    guide, ground = checked.pixels(image), np.maximum(road, 0)
     weight = np.maximum(confidence, 1e-4)
     planes = weight * (inverse - ground), weight
     total, share = (completion.smooth(guide, plane.astype(np.float32), _STRENGTH, _EDGES) for plane in planes)

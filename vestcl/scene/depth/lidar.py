@@ -8,7 +8,7 @@ from scipy import ndimage  # type: ignore[import-untyped]
 from scipy.spatial import cKDTree  # type: ignore[import-untyped]
 
 from vestcl.constants import SKY_DEPTH
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.depth.completion import smooth
 from vestcl.scene.regions import mean_by_region, superpixels
 
@@ -50,11 +50,11 @@ def densify(depth: ArrayLike, image: ArrayLike, *, sky: ArrayLike | None = None)
 
     Source: Min et al., Fast Global Image Smoothing Based on Weighted Least Squares, 2014.
     """
-    depth = _check.depth("depth", depth)
-    image = _check.planes("image", image, 3, depth)
-    far = np.zeros(depth.shape, bool) if sky is None else _check.mask("sky", sky, depth)
+    depth = checked.depth("depth", depth)
+    image = checked.planes("image", image, 3, depth)
+    far = np.zeros(depth.shape, bool) if sky is None else checked.mask("sky", sky, depth)
     inverse = _without_shine_through(depth[0])
-    spread = np.where(far, np.float32(SKY_DEPTH), 1 / _spread(inverse, _check.pixels(image))[None])
+    spread = np.where(far, np.float32(SKY_DEPTH), 1 / _spread(inverse, checked.pixels(image))[None])
     regions = superpixels(image, spread, area=_AREA)
     whole = np.exp(mean_by_region(np.log(spread[0]), regions))
     return np.where(~far & _above(depth[0] > 0), whole, spread)

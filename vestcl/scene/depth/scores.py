@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 
 #: Metres between which depths are compared, as KITTI's benchmark has it.
 NEAREST, FARTHEST = 1e-3, 80.0
@@ -45,8 +45,8 @@ def depth_scores(depth: ArrayLike, truth: ArrayLike, *, farthest: float = FARTHE
 
     Source: Eigen et al., Depth Map Prediction from a Single Image using a Multi-Scale Deep Network, 2014.
     """
-    true = _check.depth("truth", truth)
-    found = _check.depth("depth", depth, true)
+    true = checked.depth("truth", truth)
+    found = checked.depth("depth", depth, true)
     use = (true > NEAREST) & (true < farthest) & (found > 0)
     if crop:
         height, width = true.shape[1:]

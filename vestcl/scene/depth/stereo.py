@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 
 #: Depths beyond are set to it: at 1242 pixels and a baseline of 0.54 m a disparity of 2 pixels, an error of 10 %.
 FAR: Final = 200.0
@@ -83,20 +83,20 @@ def stereo_depth(
     Source: SPEC section 8; Hirschmueller, Stereo Processing by Semiglobal Matching, 2008; Min et al., Fast Global
     Image Smoothing Based on Weighted Least Squares, 2014.
     """
-    left = _check.planes("left", left, 3)
-    right = _check.planes("right", right, 3, left)
-    focal = float(_check.matrix("K", K, 3)[0, 0]) * _baseline(right_from_left)
+    left = checked.planes("left", left, 3)
+    right = checked.planes("right", right, 3, left)
+    focal = float(checked.matrix("K", K, 3)[0, 0]) * _baseline(right_from_left)
     if not far > 0:
         raise ValueError(f"`far` must be above 0 m, got {far}")
     searched = _searched(max_disparity, focal, left.shape[2])
-    disparity, agrees = _match(_check.pixels(left), _check.pixels(right), searched)
+    disparity, agrees = _match(checked.pixels(left), checked.pixels(right), searched)
     disparity = _fill_rows(disparity, agrees)
     depth = (focal / disparity.clip(min=focal / far)).astype(np.float32)
     return np.where(agrees.any() if fill else agrees, depth, np.float32(0))[None]
 
 
 def _baseline(right_from_left: ArrayLike) -> float:
-    rigid = _check.matrix("right_from_left", right_from_left, 4)
+    rigid = checked.matrix("right_from_left", right_from_left, 4)
     baseline = -float(rigid[0, 3])
     if baseline <= 0:
         raise ValueError(f"`right_from_left` must have t_x < 0 (the right camera is to the right), got {-baseline}")

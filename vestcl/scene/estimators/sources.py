@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vestcl.data.sample import Clip
 from vestcl.data.sources import ImageSource
 from vestcl.io.labels import LAST_TRAIN_ID, VOID
-from vestcl.scene import _check
+from vestcl.scene import checked
 
 #: Frames whose estimates are kept, by clip and kind. A forecast reads two frames, each more than once (depth for the
 #: layers, classes for the mask and for the sky); eight leave room for looking back, at 2 MB of depth a KITTI frame.
@@ -63,7 +63,7 @@ class CheckedDepth:
     estimate: Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
     def __call__(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        return _check.depth("depth", self.estimate(image), image)
+        return checked.depth("depth", self.estimate(image), image)
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.forecasting import baselines
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.exposure import matched_for_flow
+from vestcl.scene.flow.optical_flow import FLOW_SIDE, flow_of_grey
 
 #: Error of flow where the picture's gradient is 1 a pixel, in pixels: bare asphalt (0.0025 a pixel on a motorway) and
 #: sky (0.002) get more than a pixel, grass and rough asphalt (0.02 on KITTI) 0.2.
@@ -43,11 +43,11 @@ def correspond(src: ArrayLike, dst: ArrayLike) -> Correspondence:
 
     Source: SPEC section 8; Kroeger et al., Fast Optical Flow using Dense Inverse Search, 2016.
     """
-    src = _check.planes("src", src, 3)
-    dst = _check.planes("dst", dst, 3, src)
+    src = checked.planes("src", src, 3)
+    dst = checked.planes("dst", dst, 3, src)
     height, width = src.shape[1:]
-    if min(height, width) < baselines.FLOW_SIDE:
-        raise ValueError(f"H and W must be {baselines.FLOW_SIDE} or more for optical flow, got {height} x {width}")
+    if min(height, width) < FLOW_SIDE:
+        raise ValueError(f"H and W must be {FLOW_SIDE} or more for optical flow, got {height} x {width}")
     grey_src, grey_dst = _grey(src), _grey(dst)
     there = _flow(grey_src, grey_dst)
     matched = matched_for_flow(dst, src, there)
@@ -64,12 +64,12 @@ def correspond(src: ArrayLike, dst: ArrayLike) -> Correspondence:
 
 def _grey(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     """8-bit grey [H, W]."""
-    return np.asarray(cv2.cvtColor(_check.pixels(image), cv2.COLOR_RGB2GRAY), np.uint8)
+    return np.asarray(cv2.cvtColor(checked.pixels(image), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _flow(src: NDArray[np.uint8], dst: NDArray[np.uint8]) -> NDArray[np.float32]:
     """[2, H, W] px."""
-    flow = baselines.flow_of_grey(src, dst)
+    flow = flow_of_grey(src, dst)
     return np.stack([flow[..., 0], flow[..., 1]]).astype(np.float32, copy=False)
 
 

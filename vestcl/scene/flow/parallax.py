@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.depth.road_plane import pixels_through
 from vestcl.scene.flow.correspondence import Correspondence, check_size
 
@@ -67,9 +67,9 @@ def refine_depth(
     Raises:
         ValueError: shapes, numbers that aren't finite, or an ``inverse_std`` that is not positive.
     """
-    depth = _check.depth("depth", depth)
-    static = _check.mask("static", static, depth)
-    K = _check.matrix("K", K, 3)
+    depth = checked.depth("depth", depth)
+    static = checked.mask("static", static, depth)
+    K = checked.matrix("K", K, 3)
     if not inverse_std > 0:
         raise ValueError(f"`inverse_std` must be above 0, got {inverse_std}")
     for view in views:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl import constants
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 from vestcl.scene.inpainting.structure import structure_behind
 
@@ -53,9 +53,9 @@ def inpaint_background(
     Raises:
         ValueError: shapes, dtypes, numbers that aren't finite, zero depth, an unknown method.
     """
-    depth = _check.depth("depth", depth)
-    image = _check.planes("image", image, 3, depth)
-    mask = _check.mask("mask", mask, depth)
+    depth = checked.depth("depth", depth)
+    image = checked.planes("image", image, 3, depth)
+    mask = checked.mask("mask", mask, depth)
     if not depth.all():
         raise ValueError(f"`depth` must be above 0 m everywhere, got {int((depth == 0).sum())} pixels of 0")
     fill = inpainter(DEFAULT if method is None else method)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skimage.restoration import inpaint_biharmonic
 from torch.nn import functional
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.inpainting.holes import push_pull
 
 #: Radius of the surroundings that OpenCV's methods look at, px.
@@ -54,12 +54,12 @@ def pushed(colour: NDArray[np.float32], hole: NDArray[np.bool_], road: NDArray[n
 
 def telea(colour: NDArray[np.float32], hole: NDArray[np.bool_], road: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Fast marching (Telea, 2004)."""
-    return _planes(cv2.inpaint(_check.pixels(colour), hole[0].astype(np.uint8), _RADIUS, cv2.INPAINT_TELEA))
+    return _planes(cv2.inpaint(checked.pixels(colour), hole[0].astype(np.uint8), _RADIUS, cv2.INPAINT_TELEA))
 
 
 def navier_stokes(colour: NDArray[np.float32], hole: NDArray[np.bool_], road: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Isophotes continued (Bertalmio et al., Navier-Stokes, Fluid Dynamics, and Image and Video Inpainting, 2001)."""
-    return _planes(cv2.inpaint(_check.pixels(colour), hole[0].astype(np.uint8), _RADIUS, cv2.INPAINT_NS))
+    return _planes(cv2.inpaint(checked.pixels(colour), hole[0].astype(np.uint8), _RADIUS, cv2.INPAINT_NS))
 
 
 def frequency_selective(
@@ -69,7 +69,7 @@ def frequency_selective(
 
     def solve(small: NDArray[np.float32], gap: NDArray[np.bool_]) -> NDArray[np.float32]:
         filled = np.zeros((*gap.shape, 3), np.uint8)
-        cv2.xphoto.inpaint(_check.pixels(small), (~gap).astype(np.uint8) * 255, filled, cv2.xphoto.INPAINT_FSR_FAST)
+        cv2.xphoto.inpaint(checked.pixels(small), (~gap).astype(np.uint8) * 255, filled, cv2.xphoto.INPAINT_FSR_FAST)
         return _planes(filled)
 
     return _reduced(colour, hole, solve)

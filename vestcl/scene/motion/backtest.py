@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.depth.completion import smooth
 from vestcl.scene.depth.road_plane import linear
 from vestcl.scene.exposure import as_exposed
@@ -208,7 +208,7 @@ def coherent(positions: Array, errors: Array, image: Array, moving: NDArray[np.b
         [2, H, W] px.
     """
     centres, least = pixel_centres(*image.shape[1:]), errors.min(axis=0)
-    way, guide, weight = (positions - centres).astype(np.float32), _check.pixels(image), 1 / (least + np.float32(1e-4))
+    way, guide, weight = (positions - centres).astype(np.float32), checked.pixels(image), 1 / (least + np.float32(1e-4))
     share = np.maximum(smooth(guide, weight), np.float32(1e-6))
     around = np.stack([smooth(guide, weight * part) / share for part in way])
     alive = smooth(guide, moving.astype(np.float32)).clip(0, 1)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.data.calibration import power
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.flow.correspondence import Correspondence, check_size
 
 #: Every which pixel, both ways, takes part: neighbours of a dense flow say the same.
@@ -61,9 +61,9 @@ def ego_motion(
 
     Source: SPEC section 8; Lepetit et al., EPnP, 2009, through OpenCV's solvePnPRansac, refined by Levenberg-Marquardt.
     """
-    depth = _check.depth("depth", depth)
-    mask = _check.mask("mask", mask, depth)
-    K = _check.matrix("K", K, 3)
+    depth = checked.depth("depth", depth)
+    mask = checked.mask("mask", mask, depth)
+    K = checked.matrix("K", K, 3)
     check_size("correspondence", correspondence, depth)
     points_xyz, points_uv = _pairs(depth, mask, correspondence, K, far)
     if len(points_xyz) < _FEWEST:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.flow.correspondence import Correspondence, check_size
 from vestcl.scene.flow.parallax import epipolar, moved_pixels, pixel_centres
 
@@ -45,10 +45,10 @@ def motion_mask(
 
     Source: SPEC section 8.
     """
-    depth = _check.depth("depth", depth)
-    dst_from_src = _check.matrix("dst_from_src", dst_from_src, 4)
+    depth = checked.depth("depth", depth)
+    dst_from_src = checked.matrix("dst_from_src", dst_from_src, 4)
     check_size("correspondence", correspondence, depth)
-    K = _check.matrix("K", K, 3)
+    K = checked.matrix("K", K, 3)
     rigid = rigid_pixels(depth, K, dst_from_src)
     still = np.hypot(*(rigid - pixel_centres(*depth.shape[1:])))
     off = np.hypot(*(moved_pixels(correspondence.flow_uv) - rigid))

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.constants import SKY_DEPTH
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.depth.completion import smooth
 from vestcl.scene.depth.road_plane import linear, rays_of
 from vestcl.scene.flow.correspondence import Correspondence, sample
@@ -172,7 +172,7 @@ def follow_flow(
     q = linear(K, there)
     residual = moved_pixels(correspondence.flow_uv) - q[:2] / np.maximum(q[2], 0.1)
     believed = (depth[0] < SKY_DEPTH) & (q[2] > 0.1) & (np.hypot(*residual) < _LARGEST)
-    guide, share = _check.pixels(image), (believed / (1 + correspondence.error[0] ** 4)).astype(np.float32)
+    guide, share = checked.pixels(image), (believed / (1 + correspondence.error[0] ** 4)).astype(np.float32)
     weight = np.maximum(smooth(guide, share), np.float32(1e-6))
     planes = (np.where(believed, share * plane, 0).astype(np.float32) for plane in residual)
     spread = np.stack([smooth(guide, plane) / weight for plane in planes])

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.depth.completion import smooth
 from vestcl.scene.exposure import as_exposed
 from vestcl.scene.flow.correspondence import Correspondence, sample
@@ -75,7 +75,7 @@ def whole_objects(
     x, y = background_uv - flow_uv - 0.5
     seen = 1 - sample(dilated(moving, _INSIDE * width)[None].astype(np.float32), x, y, outside=0.0)[0]
     gain, share = (
-        smooth(_check.pixels(image), cv2.blur(plane, (_WINDOW, _WINDOW)))
+        smooth(checked.pixels(image), cv2.blur(plane, (_WINDOW, _WINDOW)))
         for plane in (seen * (by_background - by_object), seen)
     )
     return _without_holes(moving | (band & (gain > _NOISE * np.maximum(share, _UNSEEN))))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.scene import _check
+from vestcl.scene import checked
 from vestcl.scene.depth.completion import smooth
 from vestcl.scene.depth.road_plane import linear, rays_of
 from vestcl.scene.exposure import STRIDE, nearest, tone_curve
@@ -217,7 +217,7 @@ def confirmed(
         [3, H, W] m a frame.
     """
     pair = pair.equally_exposed(depth, velocity)
-    guide, regions = _check.pixels(pair.image), superpixels(pair.image, depth, area=_AREA)
+    guide, regions = checked.pixels(pair.image), superpixels(pair.image, depth, area=_AREA)
     differences = (_difference(v, depth, pair) for v in (velocity, corrected))
     before, after = ((smooth(guide, each) + mean_by_region(each, regions)) / 2 for each in differences)
     share = ((before - after) / ((1 - _LEFT) * before + _NOISE / 2)).clip(0, 1).astype(np.float32)

@@ -4,11 +4,11 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from vestcl.cli.commands import ClipOptions, Forecast
 from vestcl.cli.options import check_pixels
 from vestcl.data.street import input as street_input
 
 if TYPE_CHECKING:
-    from vestcl.cli import main as cli
     from vestcl.data.sample import Clip
 
 #: What an input is not, though it looks like one that vestcl could open.
@@ -44,7 +44,7 @@ def one_street(text: str) -> street_input.StreetInput | None:
     return street if street is not None and street.seeds is not None and "-" not in text.partition("?")[0] else None
 
 
-def check_file_options(options: "cli.Forecast | cli.Prepare") -> None:
+def check_file_options(options: ClipOptions) -> None:
     """Refuse options about files that are not given.
 
     Raises:
@@ -56,7 +56,7 @@ def check_file_options(options: "cli.Forecast | cli.Prepare") -> None:
         raise ValueError("`label_ids` is what label files hold; it needs `labels`")
 
 
-def check_folders(options: "cli.Forecast") -> None:
+def check_folders(options: ClipOptions) -> None:
     """Refuse folders of depth or label files that are none.
 
     Raises:
@@ -104,14 +104,14 @@ def is_network_file(name: str, value: str) -> bool:
     return True
 
 
-def _check_remembered(options: "cli.Forecast") -> None:
+def _check_remembered(options: Forecast) -> None:
     if options.memory is not None and options.memory < 0:
         raise ValueError(f"`memory` must be 0 frames or more, got {options.memory}")
     if options.memory is not None and options.model is not None:
         raise ValueError("`memory` is of the geometric forecast: it can't be combined with `model`")
 
 
-def check(options: "cli.Forecast") -> None:
+def check(options: Forecast) -> None:
     """Refuse options that need others.
 
     Raises:
@@ -138,7 +138,7 @@ def check(options: "cli.Forecast") -> None:
         raise ValueError("`quality` is how exactly a network computes; it needs `model`")
 
 
-def check_memory(options: "cli.Forecast", clip: "Clip", views: int) -> None:
+def check_memory(options: Forecast, clip: "Clip", views: int) -> None:
     """Refuse a forecast whose frames do not fit into the memory that is free.
 
     Raises:
