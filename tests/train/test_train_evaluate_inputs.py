@@ -22,7 +22,7 @@ from train.evaluation.inputs import (
 from train.evaluation.protocols import NOW, NOW_BORDER, PROTOCOLS, Name
 from train.evaluation.setup import Setup
 from train.evaluation.windows import forecast, inputs_of, perceptions_of, prepared, presenters, views_of, window
-from vestcl.cli.forecast import Estimators
+from vestcl.cli.clip import Estimators
 from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip, RightCamera
 from vestcl.data.sources import DisparityFile, ImageArray
