@@ -31,13 +31,13 @@ from train.evaluation.options import Evaluation, check_options
 from train.evaluation.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
 from train.evaluation.setup import Setup
 from train.evaluation.sheets import write_sheets
-from train.evaluation.windows import Part, plan, read_inputs, read_part, run_part
+from train.evaluation.windows import ShardPart, plan, read_inputs, read_part, run_part
 from train.run.ranks import Ranks, local_rank
 from vestcl import __version__, interrupt, opencl
 from vestcl.bench.common import results as _results
 from vestcl.cli import command_line, options
 from vestcl.cli.prepare import shard
-from vestcl.cli.progress import Bar
+from vestcl.cli.progress import ProgressBar
 from vestcl.data.street import input as street_input
 from vestcl.evaluation.metrics import MS_SSIM_SIDE
 from vestcl.evaluation.perceptual import Lpips, StLpips
@@ -199,9 +199,9 @@ def _caveats(config: Evaluation, setup: Setup) -> list[str]:
 # ---------------------------------------------------------------- work and results
 
 
-def _run(parts: Sequence[Part], setup: Setup, console: Console) -> None:
+def _run(parts: Sequence[ShardPart], setup: Setup, console: Console) -> None:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Bar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal)
+    bar = ProgressBar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal)
     with bar:
         task = bar.add_task("windows", total=sum(len(part.indices) for part in parts))
         for part in parts:
@@ -212,17 +212,19 @@ def _run(parts: Sequence[Part], setup: Setup, console: Console) -> None:
                 bar.advance(task, len(part.indices))
 
 
-def _results_of(config: Evaluation, setup: Setup, parts: Sequence[Part], records: Sequence[Record]) -> report.Results:
+def _results_of(
+    config: Evaluation, setup: Setup, parts: Sequence[ShardPart], records: Sequence[Record]
+) -> report.EvaluationResults:
     """What the tables are made of."""
     inputs: dict[str, Mapping[str, Inputs]] = {part.source.name: read_inputs(part) or {} for part in parts}
     leaks, unknown = training_overlap(config.model, parts, setup.steps)
     perceived = {name: later.perceived for name, later in setup.later.items() if later.perceived is not None}
     names, notes = tuple(setup.models), (*_caveats(config, setup), *unknown)
     shown = setup.protocol.shown
-    return report.Results(setup.protocol, records, shown, names, notes, leaks, setup.modes, perceived, inputs)
+    return report.EvaluationResults(setup.protocol, records, shown, names, notes, leaks, setup.modes, perceived, inputs)
 
 
-def _write(out: Path, results: report.Results, about: dict[str, Any], console: Console) -> None:
+def _write(out: Path, results: report.EvaluationResults, about: dict[str, Any], console: Console) -> None:
     machine = about["machine"]
     models = [
         f"{name}: sha256 {model['sha256'][:16]}, mode {model['mode']}"
@@ -245,7 +247,9 @@ def _write(out: Path, results: report.Results, about: dict[str, Any], console: C
         console.print(f"wrote {out / name}", soft_wrap=True, highlight=False)
 
 
-def _sheets(out: Path, sources: Sequence[Source], setup: Setup, results: report.Results, console: Console) -> None:
+def _sheets(
+    out: Path, sources: Sequence[Source], setup: Setup, results: report.EvaluationResults, console: Console
+) -> None:
     wanted = next(iter(setup.models), GEOMETRIC)
     judged = next(r for r in results.records if plain(r.method) == wanted and "psnr" in r.scores)
     own: list[Record] = [r for r in results.records if (r.view, r.method) == (judged.view, judged.method)]

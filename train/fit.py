@@ -23,7 +23,7 @@ from rich.console import Console
 from train.command import ERRORS, failed, lost_worker, warnings_in_lines
 from train.data.windows import WindowSet, loader
 from train.run import checkpoint, resume
-from train.run.checkpoint import CheckpointError, State
+from train.run.checkpoint import CheckpointError, TrainingState
 from train.run.losses import build_perceptual
 from train.run.ranks import Ranks, lost_processes_named
 from train.run.report import Reporter
@@ -47,7 +47,7 @@ class TrainingError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Options:
+class FitOptions:
     """Train a model as a configuration says."""
 
     config: tyro.conf.Positional[Path]
@@ -63,7 +63,7 @@ class Options:
 @interrupt.command
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; its exit status."""
-    options = command_line.parsed(Options, "python -m train.fit", __doc__, arguments)
+    options = command_line.parsed(FitOptions, "python -m train.fit", __doc__, arguments)
     with warnings_in_lines():
         try:
             return 0 if _fit(options) else STOPPED
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return failed(line)
 
 
-def _fit(options: Options) -> bool:
+def _fit(options: FitOptions) -> bool:
     ranks = Ranks.join()
     try:
         config = load_config(options.config, options.overrides)
@@ -117,7 +117,7 @@ def fit(config: Config, *, go_on: bool = False, ranks: Ranks | None = None, devi
         return finished
 
 
-def _last_state(config: Config, go_on: bool) -> State | None:
+def _last_state(config: Config, go_on: bool) -> TrainingState | None:
     if not go_on:
         if checkpoint.list_checkpoints(config.out):
             raise ValueError(f"`out` {config.out} has a run already: --resume goes on with it, or take another folder")
@@ -176,7 +176,7 @@ class _Run:
         self.perceptual = {loss: build_perceptual(loss) for loss in map(config.loss_of, config.stages)}
         self.step = 0
 
-    def go(self, state: State | None) -> bool:
+    def go(self, state: TrainingState | None) -> bool:
         """From ``state`` to the end; whether that was reached."""
         if state is not None:
             self._restore(state)
@@ -246,7 +246,7 @@ class _Run:
         adam, schedule = trainer.state()
         ema = self.average.model.state_dict() if self.average else None
         count = self.average.count if self.average else 0
-        state = State(
+        state = TrainingState(
             self.step, to_dict(self.config), self.model.config, self.model.state_dict(), ema, adam, schedule,
             extra={"averaged": count}, recent=self.report.recent, trained_on=self.trained_on,
         )  # fmt: skip
@@ -257,7 +257,7 @@ class _Run:
                 raise
             self.report.say(f"step {self.step}: {error}", "red")
 
-    def _restore(self, state: State) -> None:
+    def _restore(self, state: TrainingState) -> None:
         if reason := misfit(state.model, self.model.state_dict()):
             model = self.config.model
             raise ValueError(f"the checkpoint of step {state.step} holds another model than {model}: it {reason}")

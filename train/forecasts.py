@@ -92,7 +92,7 @@ class Entry(NamedTuple):
     """Frame intervals."""
 
 
-class Window(NamedTuple):
+class ForecastWindow(NamedTuple):
     """What is forecast from one frame of a clip."""
 
     clip: str
@@ -154,7 +154,7 @@ def entries(perception: Perception, truth: Clip, index: int, horizons: Sequence[
     return found
 
 
-def pack(window: Window) -> bytes:
+def pack(window: ForecastWindow) -> bytes:
     """The file of a window: 8 bits for images and coverage, float16 for the rest, compressed."""
     arrays: dict[str, Any] = {
         "clip": np.array(window.clip), "current": np.array(window.current),
@@ -169,7 +169,7 @@ def pack(window: Window) -> bytes:
     return file.getvalue()
 
 
-def unpack(path: Path, which: Callable[[int], Sequence[int]] = range) -> Window:
+def unpack(path: Path, which: Callable[[int], Sequence[int]] = range) -> ForecastWindow:
     """What `pack` wrote.
 
     Args:
@@ -190,7 +190,7 @@ def unpack(path: Path, which: Callable[[int], Sequence[int]] = range) -> Window:
                 if len(planes) != FORECAST_PLANES or len(colours) != COLOURS + 3:
                     raise ValueError(f"it has {len(planes)} planes, not {FORECAST_PLANES}")
                 found.append(Entry(planes, colours[COLOURS:], ahead[number]))
-            return Window(str(file["clip"]), int(file["current"]), found)
+            return ForecastWindow(str(file["clip"]), int(file["current"]), found)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path}: is no window of `train.forecasts` ({error}); remove it and make it again") from error
 
@@ -202,7 +202,7 @@ def make(options: Forecasts, console: Console) -> Made:
         ValueError: an input that is no clip, or an option out of range.
         OSError: a window can't be written.
     """
-    check(options)
+    check_options(options)
     made, prepare = Made(), options.as_prepare()
     tasks = plan(prepare, *shard(options.shard, {}))
     for number, task in enumerate(tasks, 1):
@@ -217,7 +217,7 @@ def make(options: Forecasts, console: Console) -> Made:
     return made
 
 
-def check(options: Forecasts) -> None:
+def check_options(options: Forecasts) -> None:
     """Refuse options out of range.
 
     Raises:
@@ -250,7 +250,9 @@ def _windows(folder: Path, clip: Clip, seen: Clip, options: Forecasts, made: Mad
             made.kept += 1
             continue
         start = time.process_time()
-        write_bytes(path, pack(Window(clip.name, index, entries(perception, clip, index, horizons, options.right))))
+        write_bytes(
+            path, pack(ForecastWindow(clip.name, index, entries(perception, clip, index, horizons, options.right)))
+        )
         made.windows, made.seconds = made.windows + 1, made.seconds + time.process_time() - start
         yield path
 

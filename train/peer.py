@@ -150,7 +150,7 @@ def loss_of(
 # ---------------------------------------------------------------- run
 
 
-class Training:
+class PeerTraining:
     """The network, its EMA weights and what is known of the run, through all stages."""
 
     def __init__(self, config: PeerConfig, network: VoxelFlowNetwork | None = None) -> None:
@@ -235,7 +235,7 @@ class Training:
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class PeerOptions:
     """Train the learned 2D peer as a configuration says."""
 
     config: tyro.conf.Positional[Path]
@@ -248,7 +248,7 @@ class Options:
 
 def main(arguments: list[str] | None = None) -> int:
     """The command; its exit status."""
-    options = tyro.cli(Options, args=arguments, description=__doc__, prog="python -m train.peer")
+    options = tyro.cli(PeerOptions, args=arguments, description=__doc__, prog="python -m train.peer")
     try:
         train(load_config(options.config, options.overrides), resume=options.resume)
     except (ValueError, OSError) as error:
@@ -277,7 +277,7 @@ def train(config: PeerConfig, *, resume: bool = False, network: VoxelFlowNetwork
     config.out.mkdir(parents=True, exist_ok=True)
     if config.run.threads:
         torch.set_num_threads(config.run.threads)
-    training = Training(config, network)
+    training = PeerTraining(config, network)
     if resume:
         training.restore()
     training.go()

@@ -204,7 +204,7 @@ def with_forecast_refinement(model: Forecaster, name: str) -> Forecaster:
 # ---------------------------------------------------------------- run
 
 
-class Training:
+class RefinementTraining:
     """The refinement, its EMA weights and what is known of the run."""
 
     def __init__(self, config: RefinementConfig, base: Forecaster) -> None:
@@ -334,7 +334,7 @@ def train(config: RefinementConfig, *, resume: bool = False, base: Forecaster | 
         raise ValueError(f"`out` {config.out} has a run already: --resume resumes it, or take another folder")
     if config.run.threads:
         torch.set_num_threads(config.run.threads)
-    training = Training(config, base or load_model(config.model))
+    training = RefinementTraining(config, base or load_model(config.model))
     config.out.mkdir(parents=True, exist_ok=True)
     if resume:
         training.restore()
@@ -343,7 +343,7 @@ def train(config: RefinementConfig, *, resume: bool = False, base: Forecaster | 
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class RefinementOptions:
     """Train the refinement of geometric forecasts as a configuration says."""
 
     config: tyro.conf.Positional[Path]
@@ -357,7 +357,7 @@ class Options:
 @interrupt.command
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; its exit status."""
-    options = tyro.cli(Options, args=arguments, description=__doc__, prog="python -m train.refinement")
+    options = tyro.cli(RefinementOptions, args=arguments, description=__doc__, prog="python -m train.refinement")
     try:
         file = train(load_config(options.config, options.overrides), resume=options.resume)
     except ERRORS as error:

@@ -25,7 +25,7 @@ STEPS: Final = ("build", "run", "float64", "splat")
 
 
 @dataclass(frozen=True)
-class Step:
+class DeviceCheck:
     """One step on one device."""
 
     name: str
@@ -38,7 +38,7 @@ class DeviceReport:
     """One device: the steps that its child came through, the last one failed unless ``works``."""
 
     info: opencl.DeviceInfo
-    steps: tuple[Step, ...]
+    steps: tuple[DeviceCheck, ...]
     notes: tuple[str, ...]
 
     @property
@@ -117,9 +117,9 @@ def _ending(code: int, errors: str) -> str:
 
 def _examine_device(info: opencl.DeviceInfo, timeout: float) -> DeviceReport:
     child = _run_child([sys.executable, "-m", "vestcl.doctor", info.index], timeout)
-    steps = [Step(**line) for line in child.lines]
+    steps = [DeviceCheck(**line) for line in child.lines]
     if child.ending:
-        steps.append(Step(STEPS[min(len(steps), len(STEPS) - 1)], False, child.ending))
+        steps.append(DeviceCheck(STEPS[min(len(steps), len(STEPS) - 1)], False, child.ending))
     notes = [f"{step.name}: {step.detail}" for step in steps if step.detail]
     if child.ending:
         notes.append("choose another device with VESTCL_DEVICE; a newer driver may mend this one")

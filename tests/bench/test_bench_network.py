@@ -13,7 +13,7 @@ from vestcl.bench.common.timing import Spread
 from vestcl.bench.network import bench as network
 from vestcl.bench.network.bench import NetworkBench, Part, Stopwatch, TimedForecaster, Timing
 from vestcl.constants import SKY_DEPTH
-from vestcl.data.street.raycast import SKY_DEPTH as STREET_SKY
+from vestcl.data.street.raycast import STREET_SKY_DEPTH as STREET_SKY
 from vestcl.models import configuration
 from vestcl.models.forecaster import Forecaster
 

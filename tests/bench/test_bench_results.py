@@ -39,7 +39,10 @@ def console() -> Console:
 def doctored(monkeypatch: pytest.MonkeyPatch, *works: bool) -> list[opencl.DeviceInfo]:
     """Let the doctor find devices that work or not, all of them the default one."""
     infos = [opencl.select() for _ in works]
-    passed, failed = tuple(doctor.Step(name, True) for name in doctor.STEPS), (doctor.Step("build", False, "ill"),)
+    passed, failed = (
+        tuple(doctor.DeviceCheck(name, True) for name in doctor.STEPS),
+        (doctor.DeviceCheck("build", False, "ill"),),
+    )
     steps = {True: passed, False: failed}
     reports = [
         doctor.DeviceReport(info, steps[work], () if work else ("build: ill",))

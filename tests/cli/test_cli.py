@@ -202,8 +202,8 @@ def test_label_ids_are_those_of_the_readers() -> None:
 
 def test_doctor_tells_what_works(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     info = opencl.select()
-    sound = doctor.DeviceReport(info, tuple(doctor.Step(name, True) for name in doctor.STEPS), ())
-    ill = doctor.DeviceReport(info, (doctor.Step("build", False, "no [ld]"),), ("build: no [ld]",))
+    sound = doctor.DeviceReport(info, tuple(doctor.DeviceCheck(name, True) for name in doctor.STEPS), ())
+    ill = doctor.DeviceReport(info, (doctor.DeviceCheck("build", False, "no [ld]"),), ("build: no [ld]",))
 
     monkeypatch.setattr(doctor, "examine", lambda timeout: doctor.Report((sound,), info.index, ()))
     assert cli.main(["doctor"]) == 0

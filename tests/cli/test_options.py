@@ -54,9 +54,9 @@ def test_what_is_refused(given: dict[str, Any], message: str, tmp_path: Path, mo
     monkeypatch.chdir(tmp_path)
     Path("file").touch()
     Path("folder").mkdir()
-    options.check(Some())
+    options.check_options(Some())
     with pytest.raises(ValueError, match=f"^{message}"):
-        options.check(Some(**given))
+        options.check_options(Some(**given))
 
 
 def test_a_command_may_write_a_file_to_out(tmp_path: Path) -> None:
@@ -65,16 +65,16 @@ def test_a_command_may_write_a_file_to_out(tmp_path: Path) -> None:
         OUTPUT_FILES: ClassVar = ("out",)
         out: tyro.conf.Positional[Path]
 
-    options.check(Export(tmp_path / "file"))
+    options.check_options(Export(tmp_path / "file"))
     with pytest.raises(ValueError, match="OUT must be a file, got the folder"):
-        options.check(Export(tmp_path))
+        options.check_options(Export(tmp_path))
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_folder_without_rights(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(ValueError, match="can't be written"):
-        options.check(Some(out=tmp_path / "out"))
+        options.check_options(Some(out=tmp_path / "out"))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vestcl import opencl
-from vestcl.data import SKY_DEPTH, Frame, Label
+from vestcl.data import STREET_SKY_DEPTH, Frame, Label
 from vestcl.data.street import objects
 from vestcl.data.street.raycast import SHADOW_CELL, SHADOW_REACH, Material, Scene, Shape, Solids, blank_frame, cast
 
@@ -41,7 +41,7 @@ def test_box_by_hand(session: opencl.Session) -> None:
     front = (np.abs(x) < 1 / 9) & (y < EYE / 9) & (y > (EYE - 2) / 9)
     road = EYE / np.where(y > 0, y, np.inf)
     # Nothing of its side or top is seen but a strip of the top's far edge: the eye is lower than the box.
-    expected = np.where(front, 9.0, np.where(y > 0, road, SKY_DEPTH))
+    expected = np.where(front, 9.0, np.where(y > 0, road, STREET_SKY_DEPTH))
     assert front.sum() > 60
     np.testing.assert_allclose(frame.depth[0, 0], expected, rtol=1e-5)
     labels = np.where(front, Label.POLE, np.where(y > 0, Label.ROAD, Label.SKY))

@@ -8,7 +8,7 @@ import torch
 
 import vestcl
 from vestcl import opencl
-from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
+from vestcl.data import STREET_SKY_DEPTH, Label, Street, intrinsics
 from vestcl.data.street.raycast import FOREGROUND
 from vestcl.data.street.street import CAMERA_HEIGHT
 from vestcl.io.labels import background
@@ -64,7 +64,7 @@ def test_depth_of_the_road_by_hand(session: opencl.Session) -> None:
 
 def test_sky_is_far_and_only_sky_is(session: opencl.Session) -> None:
     frame = look(Street.generate(1))
-    assert np.array_equal(frame.depth == SKY_DEPTH, frame.labels == Label.SKY)
+    assert np.array_equal(frame.depth == STREET_SKY_DEPTH, frame.labels == Label.SKY)
     assert frame.depth.min() > 0.1
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vestcl import opencl
-from vestcl.data import SKY_DEPTH, Label, Street, intrinsics, street_clip
+from vestcl.data import STREET_SKY_DEPTH, Label, Street, intrinsics, street_clip
 from vestcl.data.calibration import invert, translation
 from vestcl.data.street import clip as clip_module
 from vestcl.scene.depth.stereo import stereo_depth
@@ -63,7 +63,7 @@ def test_every_picture_is_rendered_once(session: opencl.Session) -> None:
 def test_reads_as_any_clip(session: opencl.Session) -> None:
     clip = street_clip(Street.generate(1), 3, HEIGHT, WIDTH)
     labels, depth = clip[0].read_labels(), clip[0].read_depth()
-    assert np.array_equal(depth == SKY_DEPTH, labels == Label.SKY)
+    assert np.array_equal(depth == STREET_SKY_DEPTH, labels == Label.SKY)
     assert np.array_equal(clip[0].read_mask(), ~np.isin(labels, (Label.CAR, Label.POLE, Label.PERSON)))
     small = clip.resized(24, 80)
     assert small[1].read_image().shape == (3, 24, 80)

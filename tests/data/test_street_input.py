@@ -10,7 +10,7 @@ import pytest
 from vestcl import opencl
 from vestcl.cli import main as cli
 from vestcl.cli.prepare import open_input, plan
-from vestcl.data import SKY_DEPTH, Label, Street, street_clip
+from vestcl.data import STREET_SKY_DEPTH, Label, Street, street_clip
 from vestcl.data.street import input as street_input
 from vestcl.data.street.clip import Shot
 from vestcl.data.street.driving.road import RoadDrive
@@ -115,7 +115,7 @@ def test_a_scan_is_sparse_and_true(session: opencl.Session) -> None:
         there = scan > 0
         assert np.abs(scan[there] - truth[there]).max() < 0.15
         assert (scan[there] - truth[there]).std() == pytest.approx(0.02, rel=0.2)
-        assert not (truth[there] == SKY_DEPTH).any() and scan[there].max() < 121
+        assert not (truth[there] == STREET_SKY_DEPTH).any() and scan[there].max() < 121
         rows = np.flatnonzero(there[0].any(axis=1))
         assert rows.min() > 40  # 2 degrees above the horizon
     assert 0.05 < shares[0] < 0.25 and shares[0] > 1.8 * shares[1] > 3 * shares[2]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vestcl import opencl
-from vestcl.data import SKY_DEPTH, Label, Street, intrinsics
+from vestcl.data import STREET_SKY_DEPTH, Label, Street, intrinsics
 from vestcl.data.street.driving.drive import world_from_camera
 
 HEIGHT, WIDTH = 96, 320
@@ -64,7 +64,7 @@ def test_the_sky_only_turns(session: opencl.Session) -> None:
     straight[:3, 3] = 0.3, -0.2, -1.0
     assert np.abs(move(street, 0.0, STEP, after=straight @ cur)[:, sky]).max() < 1e-9
     turn = world_from_camera(0.4, 0.0, 2.0, 0.05, 0.02, -0.01)
-    points = lift(np.full((1, HEIGHT, WIDTH), SKY_DEPTH))
+    points = lift(np.full((1, HEIGHT, WIDTH), STREET_SKY_DEPTH))
     turned = np.einsum("ij,jhw->ihw", turn[:3, :3], points) - points
     np.testing.assert_allclose(move(street, 0.0, STEP, after=turn @ cur)[:, sky], turned[:, sky], atol=1e-3)
 

@@ -13,7 +13,7 @@ from vestcl.data.calibration import translation
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import ImageArray
 from vestcl.forecasting.files import Details, machine, read_forecast, write_forecast
-from vestcl.forecasting.result import Forecast, Rendered, Skipped, View
+from vestcl.forecasting.result import Forecast, Rendered, SkippedWork, View
 from vestcl.forecasting.views import parse_views
 from vestcl.io.images import to_float
 from vestcl.io.video.reading import Video
@@ -86,7 +86,7 @@ def test_round_trip(tmp_path: Path) -> None:
 def test_what_a_network_skipped_is_told(tmp_path: Path) -> None:
     clip = make_clip()
     views = parse_views(["source"], clip)
-    skipped = {"seen": Skipped(1, 2, "frames", 0.25), "covered": Skipped(9000, 10_000, "points", None)}
+    skipped = {"seen": SkippedWork(1, 2, "frames", 0.25), "covered": SkippedWork(9000, 10_000, "points", None)}
     forecast = replace(make_forecast(views), profile={"encode": 0.5}, skipped=skipped)
     write_forecast(tmp_path, forecast, clip, 1, views, Details(""))
     about = read_forecast(tmp_path).about
@@ -95,7 +95,7 @@ def test_what_a_network_skipped_is_told(tmp_path: Path) -> None:
         "seen": {"skipped": 1, "of": 2, "unit": "frames", "saved_seconds": 0.25, "share": 0.5},
         "covered": {"skipped": 9000, "of": 10_000, "unit": "points", "saved_seconds": None, "share": 0.9},
     }
-    told = [str(Skipped(**{key: one[key] for key in Skipped._fields})) for one in about["skipped"].values()]
+    told = [str(SkippedWork(**{key: one[key] for key in SkippedWork._fields})) for one in about["skipped"].values()]
     assert told == ["50 % of 2 frames, about 0.25 s", "90 % of 10,000 points"]
     write_forecast(tmp_path, make_forecast(views), clip, 1, views, Details(""))
     assert not {"profile", "skipped"} & set(read_forecast(tmp_path).about)

@@ -13,7 +13,7 @@ from geometric_scenes import HEIGHT, WIDTH, Floats, K, Matrix, decibels, drive, 
 
 from vestcl.forecasting.geometric import memory
 from vestcl.forecasting.geometric.forecast import _static, forecast_frames
-from vestcl.forecasting.geometric.memory import Memory, remember
+from vestcl.forecasting.geometric.memory import SceneMemory, remember
 from vestcl.forecasting.geometric.render import HOLE, Shown, holes, show
 from vestcl.forecasting.result import Forecast, View
 from vestcl.scene.perception import Perception, Surface
@@ -71,13 +71,13 @@ def wall(yaw: float) -> tuple[Floats, Floats]:
     return np.stack(planes), depth[None].astype(np.float32)
 
 
-def recalled(frames: int, perception: Any = None) -> Memory:
+def recalled(frames: int, perception: Any = None) -> SceneMemory:
     found = remember(perception or Turning(), NOW, frames)
     assert found is not None
     return found
 
 
-def shown_left(found: Memory, yaw: float) -> Shown:
+def shown_left(found: SceneMemory, yaw: float) -> Shown:
     """From a camera at t that is turned left by ``yaw`` radians."""
     return show([_static(found)(0, [np.eye(4)])], K, turned(yaw, 0, 0, (0, 0, 0)), HEIGHT, WIDTH)
 

@@ -6,7 +6,7 @@ import torch
 from data_files import pose
 from geometric_scenes import HEIGHT, WIDTH, Floats, K, Matrix, cloud_of, decibels, flat, noise, planes, room
 
-from vestcl.forecasting.geometric.render import Cloud, Shown, holes, rendered, show
+from vestcl.forecasting.geometric.render import FrameCloud, Shown, holes, rendered, show
 from vestcl.scene.flow.optical_flow import backward_warp
 
 EYE = np.eye(4)
@@ -18,7 +18,7 @@ def colour(rgb: tuple[float, float, float]) -> Floats:
     return np.broadcast_to(planes(*rgb), (3, HEIGHT, WIDTH))
 
 
-def seen(*clouds: Cloud, tgt_from_next: Matrix = EYE) -> Shown:
+def seen(*clouds: FrameCloud, tgt_from_next: Matrix = EYE) -> Shown:
     return show(list(clouds), K, tgt_from_next, HEIGHT, WIDTH)
 
 

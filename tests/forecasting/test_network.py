@@ -15,7 +15,7 @@ from vestcl.data.sample import Clip
 from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.network.forecast import forecast_clip, forecast_frames, show_frame, what_was_skipped
 from vestcl.forecasting.network.input import last_motions, network_input
-from vestcl.forecasting.result import Forecast, Skipped, View
+from vestcl.forecasting.result import Forecast, SkippedWork, View
 from vestcl.models.forecaster import Forecaster, perceive_estimated
 from vestcl.models.inference.skipping import Count, Tally
 from vestcl.models.inference.stage_times import REST, STAGES
@@ -161,11 +161,11 @@ def test_what_skipping_saved_by_hand() -> None:
     }
     found = what_was_skipped(Tally(counts), profile)
     assert found == {
-        "seen": Skipped(1, 2, "frames", 4.0),
-        "background": Skipped(20, 30, "px", 2.0),
-        "objects": Skipped(10, 30, "px", 3.0),
-        "covered": Skipped(7, 9, "points", None),
-        "views": Skipped(0, 2, "views", 0.0),
+        "seen": SkippedWork(1, 2, "frames", 4.0),
+        "background": SkippedWork(20, 30, "px", 2.0),
+        "objects": SkippedWork(10, 30, "px", 3.0),
+        "covered": SkippedWork(7, 9, "points", None),
+        "views": SkippedWork(0, 2, "views", 0.0),
     }
     empty = what_was_skipped(Tally({name: Count(count.of, *count[1:]) for name, count in counts.items()}), profile)
     assert empty["background"].saved_seconds == 4.0

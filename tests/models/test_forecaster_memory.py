@@ -17,7 +17,7 @@ from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.fast import accelerate
 from vestcl.models.inference.skipping import NOTHING, count_skips
 from vestcl.models.steps.frames import EncodedFrame
-from vestcl.models.steps.memory import Memory
+from vestcl.models.steps.memory import EncodedFrames
 from vestcl.scene.layers import LayerBatch
 
 HEIGHT, WIDTH = 32, 64
@@ -287,7 +287,10 @@ def test_copies_begin_with_an_empty_memory() -> None:
 
 def test_each_thread_has_room_for_two_frames() -> None:
     """In turns with other threads each finds its own frames again; beyond eight frames the oldest go."""
-    memory, images = Memory(), [LayerBatch(*(torch.full((1, 1, 2, 2), float(number)),) * 5) for number in range(12)]
+    memory, images = (
+        EncodedFrames(),
+        [LayerBatch(*(torch.full((1, 1, 2, 2), float(number)),) * 5) for number in range(12)],
+    )
 
     def keep(*numbers: int) -> None:
         state = memory.state("settings", [torch.ones(2)])

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from vestcl.scene.flow.parallax import pixel_centres
 from vestcl.scene.motion.backtest import (
-    Frame,
+    BacktestFrame,
     backtest,
     by_step,
     candidates,
@@ -35,7 +35,7 @@ def texture() -> Image:
     return cv2.GaussianBlur(noise, (0, 0), 2).transpose(2, 0, 1) * 3 % 1
 
 
-def frames(left: float, right: float, elapsed: float = 1.0) -> tuple[Frame, Frame]:
+def frames(left: float, right: float, elapsed: float = 1.0) -> tuple[BacktestFrame, BacktestFrame]:
     """Two frames of a wall whose left and right half move by ``left`` and ``right`` px; the camera does not."""
     wide = texture()
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
@@ -47,7 +47,7 @@ def frames(left: float, right: float, elapsed: float = 1.0) -> tuple[Frame, Fram
 
     flow_uv = np.stack([-shift, np.zeros_like(shift)])
     depth, still = np.full((1, HEIGHT, WIDTH), DEPTH, np.float32), np.zeros((3, HEIGHT, WIDTH), np.float32)
-    before, after = (Frame(shown(time), depth, still, flow_uv, np.eye(4), K, elapsed) for time in (0, 1))
+    before, after = (BacktestFrame(shown(time), depth, still, flow_uv, np.eye(4), K, elapsed) for time in (0, 1))
     return before, after
 
 
@@ -105,7 +105,7 @@ def test_at_a_place_motion_ends_where_the_flow_does(ahead: float) -> None:
     assert (positions[PLACE][0, :, :80] < WIDTH / 2 + 8).all() and positions[FLOW][0, :, 79].min() > WIDTH / 2 + 7
 
 
-def errors_of(before: Frame, after: Frame, positions: Image) -> Image:
+def errors_of(before: BacktestFrame, after: BacktestFrame, positions: Image) -> Image:
     return backtest(positions, before, after.image, [after.flow_uv])
 
 
@@ -198,7 +198,7 @@ def test_an_object_is_held_together() -> None:
 def test_two_frames_mix_velocity_and_residual_flow() -> None:
     depth = np.full((1, 8, 12), 5.0, np.float32)
     one = np.ones((3, 8, 12), np.float32)
-    frame = Frame(one, depth, 0 * one, 0 * one[:2], np.eye(4), np.diag([10.0, 10.0, 1.0]))
+    frame = BacktestFrame(one, depth, 0 * one, 0 * one[:2], np.eye(4), np.diag([10.0, 10.0, 1.0]))
     errors = untested(frame)
     assert errors.shape == (4, 8, 12)
     positions = np.stack([np.full((2, 8, 12), value, np.float32) for value in (2.0, 50.0, 4.0, 90.0)])

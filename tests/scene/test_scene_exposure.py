@@ -7,7 +7,7 @@ from geometric_scenes import HEIGHT, WIDTH, Floats, flat, move, noise, points, t
 from vestcl.scene.exposure import as_exposed, curve_by_flow, matched_for_flow, nearest, tone_curve
 from vestcl.scene.flow.correspondence import correspond, sample
 from vestcl.scene.flow.parallax import pixel_centres
-from vestcl.scene.motion.backtest import Frame, backtest
+from vestcl.scene.motion.backtest import BacktestFrame, backtest
 
 STILL = np.zeros((2, HEIGHT, WIDTH), np.float32)
 
@@ -92,7 +92,7 @@ def test_flow_between_different_exposures(gain: float) -> None:
 def test_a_backtest_between_different_exposures() -> None:
     """Of rest and a wrong position rest is right, however bright the frames are."""
     K = np.array([[200.0, 0, WIDTH / 2], [0, 200.0, HEIGHT / 2], [0, 0, 1]])
-    before = Frame(exposed(GREY, 1 / 1.2), flat(10), np.zeros_like(GREY), STILL, np.eye(4), K)
+    before = BacktestFrame(exposed(GREY, 1 / 1.2), flat(10), np.zeros_like(GREY), STILL, np.eye(4), K)
     rest = pixel_centres(HEIGHT, WIDTH).astype(np.float32)
     errors = backtest(np.stack([rest + np.float32(8), rest]), before, GREY, [STILL])
     assert (errors[1] < 0.1 * errors[0])[10:-20, 20:-20].all()

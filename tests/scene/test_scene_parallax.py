@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from geometric_scenes import HEIGHT, WIDTH, Floats, K, exact_flow, flat, planes, room, turned, with_noise
 
-from vestcl.scene.flow.parallax import View, refine_depth
+from vestcl.scene.flow.parallax import OtherFrame, refine_depth
 
 FORWARD = turned(0.01, -0.005, 0.002, (0.05, 0.0, -0.9))
 EVERYWHERE = np.ones((1, HEIGHT, WIDTH), bool)
@@ -25,8 +25,8 @@ SIDEWAYS = turned(0, 0, 0, (-SIDE, 0.0, 0.0))
 BLOCK = np.s_[:, 40:60, 150:175]
 
 
-def view(depth: Floats, motion: Any = SIDEWAYS) -> View:
-    return View(exact_flow(depth, motion), motion)
+def view(depth: Floats, motion: Any = SIDEWAYS) -> OtherFrame:
+    return OtherFrame(exact_flow(depth, motion), motion)
 
 
 def test_exact_inputs_stay() -> None:
@@ -41,7 +41,9 @@ def test_noisy_depth_gets_better_by_the_predicted_factor(views: int) -> None:
     truth = flat(15)
     error = np.random.default_rng(0).normal(0, INVERSE_STD, truth.shape)
     depth = (1 / (1 / truth + error)).astype(np.float32)
-    seen = [View(with_noise(exact_flow(truth, SIDEWAYS), FLOW_STD, seed), SIDEWAYS) for seed in range(1, 1 + views)]
+    seen = [
+        OtherFrame(with_noise(exact_flow(truth, SIDEWAYS), FLOW_STD, seed), SIDEWAYS) for seed in range(1, 1 + views)
+    ]
     refined = refine_depth(depth, INVERSE_STD, K, seen, EVERYWHERE)
     kept = refined > 0
     assert kept.mean() > 0.999  # one flow in 16,000 is off its line by 4 standard deviations, and refuted
@@ -154,7 +156,10 @@ def test_what_is_far_away_stays() -> None:
         ({"K": np.eye(4)}, r"`K` must be \[3, 3\], got \[4, 4\]"),
         ({"inverse_std": 0.0}, "`inverse_std` must be above 0, got 0.0"),
         ({"inverse_std": float("nan")}, "`inverse_std` must be above 0, got nan"),
-        ({"views": [View(exact_flow(room()[..., 1:], SIDEWAYS), SIDEWAYS)]}, r"\[., 96, 320\], got \[., 96, 319\]"),
+        (
+            {"views": [OtherFrame(exact_flow(room()[..., 1:], SIDEWAYS), SIDEWAYS)]},
+            r"\[., 96, 320\], got \[., 96, 319\]",
+        ),
     ],
 )
 def test_refuses(change: dict[str, Any], message: str) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from forecaster_scenes import TINY
 
-from train.run.checkpoint import State, list_checkpoints
+from train.run.checkpoint import TrainingState, list_checkpoints
 from train.settings.config import Config, from_dict, to_dict
 
 SETTINGS: dict[str, Any] = {
@@ -22,7 +22,7 @@ def configured(**changes: Any) -> Config:
     return from_dict({**SETTINGS, **changes})
 
 
-def state_of(step: int, seed: int = 0, **fields: Any) -> State:
+def state_of(step: int, seed: int = 0, **fields: Any) -> TrainingState:
     """Small, with other numbers for another step or seed."""
     generator = torch.Generator().manual_seed(1000 * seed + step)
     weights = {name: torch.randn(50, 3, generator=generator) for name in ("a.weight", "b.weight")}
@@ -32,7 +32,7 @@ def state_of(step: int, seed: int = 0, **fields: Any) -> State:
         "param_groups": [],
     }
     fields = {"trained_on": {"street 3": (0, step)}, **fields}
-    return State(step, to_dict(configured()), TINY, weights, ema, moments, {"last_epoch": step}, **fields)
+    return TrainingState(step, to_dict(configured()), TINY, weights, ema, moments, {"last_epoch": step}, **fields)
 
 
 def steps(out: Path) -> list[int]:

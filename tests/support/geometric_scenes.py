@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vestcl.data import Street, intrinsics, street_clip
 from vestcl.data.sample import Clip
-from vestcl.forecasting.geometric.render import Cloud
+from vestcl.forecasting.geometric.render import FrameCloud
 from vestcl.scene.flow.correspondence import Correspondence
 
 Floats = NDArray[np.float32]
@@ -97,12 +97,12 @@ def cloud_of(
     dst_from_src: Matrix | None = None,
     step_xyz: tuple[float, float, float] = (0.0, 0.0, 0.0),
     K: Matrix = K,
-) -> Cloud:
+) -> FrameCloud:
     """The pixels of ``which`` [H, W] as points, seen from dst."""
     y, x = np.nonzero(np.ones(depth.shape[1:], bool) if which is None else which)
     xyz = move(pose() if dst_from_src is None else dst_from_src, points(depth, K))[:, y, x].T.astype(np.float32)
     steps = np.tile(np.array(step_xyz, np.float32), (len(x), 1))
-    return Cloud(xyz, depth[0, y, x], image, steps, y, x)
+    return FrameCloud(xyz, depth[0, y, x], image, steps, y, x)
 
 
 def decibels(got: NDArray[Any], wanted: NDArray[Any], where: NDArray[np.bool_] | None = None) -> float:

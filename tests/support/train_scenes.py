@@ -149,7 +149,7 @@ def _at_update(wanted: int, number: int) -> None:
 def _at_checkpoint(attribute: str, wanted: int, number: int) -> None:
     save, original, step = checkpoint.save, getattr(checkpoint, attribute), [0]
 
-    def saving(out: Path | str, state: checkpoint.State, keep: int = 3) -> Path:
+    def saving(out: Path | str, state: checkpoint.TrainingState, keep: int = 3) -> Path:
         step[0] = state.step
         return save(out, state, keep)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from test_network_input import HEIGHT, MOTIONS, WIDTH, prepared
 
 from train.data import augment
-from train.data.augment import Window
+from train.data.augment import TrainingWindow
 from vestcl import geometry, reference
 from vestcl.forecasting.network.input import last_motions, network_input
 from vestcl.models import EgoMotion, RigidMotion
@@ -23,7 +23,7 @@ from vestcl.scene.motion.ego_motion import constant_velocity
 TGT_FROM_NEXT = turned(0.01, 0.02, -0.01, (-0.54, 0.02, 0.01))
 TARGET_K = np.array([[22.0, 0.3, 5.9], [0, 20.5, 4.4], [0, 0, 1]])
 
-Change = tuple[Callable[[Window], Window], Callable[[float, float], tuple[float, float]], float]
+Change = tuple[Callable[[TrainingWindow], TrainingWindow], Callable[[float, float], tuple[float, float]], float]
 """A change, where it takes a point of the picture, and the sign of x in the changed world."""
 
 CHANGES: dict[str, Change] = {
@@ -39,15 +39,15 @@ CHANGES: dict[str, Change] = {
 
 
 @pytest.fixture
-def window() -> Window:
+def window() -> TrainingWindow:
     """Two random frames, the bonnet in both, and a target from beside."""
     target = np.random.default_rng(9).random((3, HEIGHT, WIDTH), np.float32)
     prev, cur = prepared(0, MOTIONS[0], own=True), prepared(1, MOTIONS[1], own=True)
     path = MOTIONS[1], MOTIONS[0] @ MOTIONS[1]
-    return Window(prev, cur, target, TARGET_K, TGT_FROM_NEXT, path[1], path)
+    return TrainingWindow(prev, cur, target, TARGET_K, TGT_FROM_NEXT, path[1], path)
 
 
-def shown_at(window: Window, xyz: NDArray[Any], velocity: NDArray[Any]) -> NDArray[np.float64]:
+def shown_at(window: TrainingWindow, xyz: NDArray[Any], velocity: NDArray[Any]) -> NDArray[np.float64]:
     """Where the target shows, by the prior, a point of the current camera that moves at ``velocity``: (u, v) px."""
     next_from_cur = constant_velocity(last_motions(window.prev, window.cur))
     tgt_from_cur = window.tgt_from_next @ next_from_cur
@@ -56,7 +56,7 @@ def shown_at(window: Window, xyz: NDArray[Any], velocity: NDArray[Any]) -> NDArr
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_points_are_projected_to_where_the_changed_target_shows_them(window: Window, name: str) -> None:
+def test_points_are_projected_to_where_the_changed_target_shows_them(window: TrainingWindow, name: str) -> None:
     change, moved, sign = CHANGES[name]
     changed, side = change(window), np.array([sign, 1, 1])
     for u, v, z in ((4.5, 3.5, 6.0), (8.5, 5.5, 30.0), (6.25, 2.75, 11.0)):
@@ -69,7 +69,7 @@ def test_points_are_projected_to_where_the_changed_target_shows_them(window: Win
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_true_motion_changes_as_the_cameras_do(window: Window, name: str) -> None:
+def test_true_motion_changes_as_the_cameras_do(window: TrainingWindow, name: str) -> None:
     changed = CHANGES[name][0](window)
     assert window.future_from_cur is not None and changed.future_from_cur is not None
     composed = np.linalg.multi_dot(last_motions(changed.prev, changed.cur))
@@ -79,7 +79,7 @@ def test_true_motion_changes_as_the_cameras_do(window: Window, name: str) -> Non
     np.testing.assert_allclose(first, last_motions(changed.cur)[0], rtol=0, atol=1e-12)
 
 
-def test_planes_are_cut_and_mirrored_alike(window: Window) -> None:
+def test_planes_are_cut_and_mirrored_alike(window: TrainingWindow) -> None:
     cut, mirrored = augment.crop(window, 2, 3, 5, 7), augment.flip(window)
     for frame in ("prev", "cur"):
         whole, part, other = (getattr(each, frame) for each in (window, cut, mirrored))
@@ -94,7 +94,7 @@ def test_planes_are_cut_and_mirrored_alike(window: Window) -> None:
     assert cut.size == (5, 7) and mirrored.size == window.size
 
 
-def test_mirrored_motions_have_the_quaternions_of_a_mirror(window: Window) -> None:
+def test_mirrored_motions_have_the_quaternions_of_a_mirror(window: TrainingWindow) -> None:
     prior, mirrored = (
         network_input(each.prev, each.cur, last_motions(each.prev, each.cur)).prior
         for each in (window, augment.flip(window))
@@ -107,7 +107,7 @@ def test_mirrored_motions_have_the_quaternions_of_a_mirror(window: Window) -> No
     torch.testing.assert_close(mirrored.velocity_cur, prior.velocity_cur.flip(3) * sides, rtol=0, atol=1e-5)
 
 
-def test_a_camera_sways_in_the_mirror_as_before_it(window: Window) -> None:
+def test_a_camera_sways_in_the_mirror_as_before_it(window: TrainingWindow) -> None:
     """Turns about x and shifts along y and z stay, all others change sign: weights that mix neither kind with the
     other forecast the mirrored path from mirrored motions."""
     network = EgoMotion(EgoMotionConfig(widths=(8, 8, 8, 8), blocks=1, heads=2, path=2), 4, "prior").double()
@@ -128,11 +128,11 @@ def test_a_camera_sways_in_the_mirror_as_before_it(window: Window) -> None:
         torch.testing.assert_close(after, mirror @ before @ mirror, rtol=0, atol=1e-6)  # the prior is float32
 
 
-def test_a_right_camera_becomes_a_left_one(window: Window) -> None:
+def test_a_right_camera_becomes_a_left_one(window: TrainingWindow) -> None:
     assert augment.flip(window).tgt_from_next[0, 3] == -window.tgt_from_next[0, 3] > 0
 
 
-def test_flipped_twice_a_window_is_as_before(window: Window) -> None:
+def test_flipped_twice_a_window_is_as_before(window: TrainingWindow) -> None:
     twice = augment.flip(augment.flip(window))
     for before, after in ((window.prev, twice.prev), (window.cur, twice.cur)):
         for name, planes in vars(before.layers).items():
@@ -146,7 +146,7 @@ def test_flipped_twice_a_window_is_as_before(window: Window) -> None:
     assert np.array_equal(twice.path_from_cur, window.path_from_cur)
 
 
-def splatted(window: Window) -> torch.Tensor:
+def splatted(window: TrainingWindow) -> torch.Tensor:
     """[1, 3, H, W]: the current frame as the target's camera will see it by the prior, in float64."""
     frame = window.cur
     depth, K, target_K = (torch.from_numpy(array.copy()).double()[None] for array in (
@@ -164,13 +164,13 @@ def splatted(window: Window) -> torch.Tensor:
     return reference.splat(points_uv, z, radii, 0.8 * torch.ones_like(z), colours, *window.size)[0]
 
 
-def test_splat_of_the_flipped_window_is_the_flipped_splat(window: Window) -> None:
+def test_splat_of_the_flipped_window_is_the_flipped_splat(window: TrainingWindow) -> None:
     there, back = splatted(window), splatted(augment.flip(window)).flip(3)
     assert float(there.abs().mean()) > 0.05
     torch.testing.assert_close(back, there, rtol=0, atol=1e-9)
 
 
-def test_shrinking_takes_means_of_pictures_and_pixels_of_all_else(window: Window) -> None:
+def test_shrinking_takes_means_of_pictures_and_pixels_of_all_else(window: TrainingWindow) -> None:
     small = augment.resize(window, HEIGHT // 2, WIDTH // 2)
     means = window.target.reshape(3, HEIGHT // 2, 2, WIDTH // 2, 2).mean(axis=(2, 4))
     np.testing.assert_allclose(small.target, means, rtol=0, atol=1e-6)
@@ -180,7 +180,7 @@ def test_shrinking_takes_means_of_pictures_and_pixels_of_all_else(window: Window
     assert augment.resize(window, HEIGHT, WIDTH) is window
 
 
-def test_all_pictures_are_coloured_alike(window: Window) -> None:
+def test_all_pictures_are_coloured_alike(window: TrainingWindow) -> None:
     change = augment.draw_colour(np.random.default_rng(4), 1.0, 0.4)
     coloured = augment.colour(window, change)
     assert np.array_equal(coloured.target, change(window.target))
@@ -193,7 +193,7 @@ def test_all_pictures_are_coloured_alike(window: Window) -> None:
     assert np.abs(coloured.target - window.target).mean() > 0.02
 
 
-def test_colours_stay_in_range_and_without_strength_as_they_are(window: Window) -> None:
+def test_colours_stay_in_range_and_without_strength_as_they_are(window: TrainingWindow) -> None:
     for seed in range(30):
         change = augment.draw_colour(np.random.default_rng(seed), 1.0, 0.5)
         image = change(window.target)
@@ -220,7 +220,7 @@ def test_luma_by_hand() -> None:
     assert augment.mean_luma(image) == pytest.approx(0.587 / 2)
 
 
-def test_what_is_out_of_range_is_refused(window: Window) -> None:
+def test_what_is_out_of_range_is_refused(window: TrainingWindow) -> None:
     with pytest.raises(ValueError, match="`crop` must lie in 8x12, got 5x7 at row 4, column 3"):
         augment.crop(window, 4, 3, 5, 7)
     with pytest.raises(ValueError, match="`crop` must lie in"):

@@ -18,7 +18,7 @@ from train.card import tables as card_tables
 from train.card.__main__ import Card, main, portable, thinned, write_card
 from train.card.pictures import draw_curves, smoothed, stages_of, write_sheet
 from train.evaluation.protocols import PROTOCOLS
-from train.evaluation.report import Results, as_json
+from train.evaluation.report import EvaluationResults, as_json
 from train.evaluation.windows import CAMERA, CONSTANT_VELOCITY
 from train.run import checkpoint
 from train.run.report import LOG
@@ -83,7 +83,7 @@ def results(folder: Path, sha256: str) -> Path:
         "machine": {"cores": "3", "processor": "Some CPU", "device": "0:0 Some OpenCL", "date": "2030-01-02T03:04"},
     }
     folder.mkdir()
-    told = as_json(Results(PROTOCOLS["street"], records, (1, 2), ("tiny", "rival"), ("It was told.",)), about)
+    told = as_json(EvaluationResults(PROTOCOLS["street"], records, (1, 2), ("tiny", "rival"), ("It was told.",)), about)
     (folder / "results.json").write_text(json.dumps(told))
     noise = np.random.default_rng(0).integers(0, 256, (500, 1200, 3), np.uint8)
     for word in ("best", "worst"):
@@ -100,7 +100,7 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> Card:
     settings = {**SETTINGS, "out": str(folder / "run")}
     config = from_dict({**settings, "data": {**SETTINGS["data"], "train": [str(folder / "streets")]}})
     weights = Forecaster(TINY).state_dict()
-    state = checkpoint.State(100, to_dict(config), TINY, weights, weights, {}, {}, versions={"torch": "9.9"})
+    state = checkpoint.TrainingState(100, to_dict(config), TINY, weights, weights, {}, {}, versions={"torch": "9.9"})
     path = checkpoint.save(folder / "run", state)
     (folder / "run" / LOG).write_text("".join(json.dumps(row) + "\n" for row in log()))
     sha256 = hashlib.sha256((path / "ema.safetensors").read_bytes()).hexdigest()

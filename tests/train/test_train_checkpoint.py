@@ -16,7 +16,15 @@ from checkpoint_states import configured, state_of, steps
 from forecaster_scenes import TINY, camera, pair_of
 
 from train.run import checkpoint, hashes
-from train.run.checkpoint import CheckpointError, State, list_checkpoints, load_latest, restore_rng, rng_state, save
+from train.run.checkpoint import (
+    CheckpointError,
+    TrainingState,
+    list_checkpoints,
+    load_latest,
+    restore_rng,
+    rng_state,
+    save,
+)
 from train.settings.config import from_dict
 from vestcl.models.forecaster import Forecaster
 
@@ -81,7 +89,7 @@ def test_adam_goes_on_to_the_same_bits(tmp_path: Path) -> None:
     straight = build()
     train(*straight, 2)
     rest = {"optimiser": straight[1].state_dict(), "scheduler": straight[2].state_dict()}
-    save(tmp_path, State(2, {}, TINY, straight[0].state_dict(), None, **rest))
+    save(tmp_path, TrainingState(2, {}, TINY, straight[0].state_dict(), None, **rest))
     train(*straight, 2)
     loaded, resumed = load_latest(tmp_path), build()
     assert loaded is not None

@@ -250,7 +250,7 @@ def test_other_frames_of_a_clip_are_no_overlap(tmp_path: Path) -> None:
     model = stir(Forecaster(TINY))
     write_checkpoint(tmp_path / "a.safetensors", model.config, model.state_dict(), {"street 3": (0, 3), "x": (0, 9)})
     for index, overlaps in ((4, True), (5, False)):
-        part = evaluate_windows.Part(Source("street 3", Street.generate), (index,), tmp_path / "part")
+        part = evaluate_windows.ShardPart(Source("street 3", Street.generate), (index,), tmp_path / "part")
         leaks, unknown = training_overlap([tmp_path / "a.safetensors"], [part], 2)
         assert bool(leaks) == overlaps and unknown == ()
 

@@ -3,7 +3,7 @@
 import dataclasses
 
 from train.evaluation.protocols import NOW, PROTOCOLS, Protocol
-from train.evaluation.report import Results, as_json, grids, headline, markdown, short_grids, table_of_windows
+from train.evaluation.report import EvaluationResults, as_json, grids, headline, markdown, short_grids, table_of_windows
 from train.evaluation.windows import CAMERA, CONSTANT_VELOCITY
 from vestcl.evaluation.scores import GEOMETRIC, Record
 from vestcl.evaluation.tables import Grid
@@ -15,7 +15,7 @@ def record(method: str, clip: str, values: list[float], view: str = "source", me
     return Record(clip, "000003", 3, view, method, 0.5, {metric: values}, first=0 if view == NOW else 1)
 
 
-def results(*more: Record, protocol: Protocol = PROTOCOLS["kitti-space"]) -> Results:
+def results(*more: Record, protocol: Protocol = PROTOCOLS["kitti-space"]) -> EvaluationResults:
     """Two clips, a model that is better by 0.1 in one and worse by 0.05 in the other at t+1."""
     records = [
         record(GEOMETRIC, "a", [0.8, 0.6, 0.4]),
@@ -24,7 +24,7 @@ def results(*more: Record, protocol: Protocol = PROTOCOLS["kitti-space"]) -> Res
         record("ours", "b", [0.55, 0.5, 0.2]),
         *more,
     ]
-    return Results(protocol, records, (1, 3), ("ours",), ("Told.",))
+    return EvaluationResults(protocol, records, (1, 3), ("ours",), ("Told.",))
 
 
 def test_tables_name_how_models_made_later_frames() -> None:
@@ -68,7 +68,7 @@ def test_the_present_has_a_column_of_its_own() -> None:
 def test_running_means_are_up_to_the_horizon() -> None:
     protocol = dataclasses.replace(PROTOCOLS["kitti-space"], now=False)
     pictures = [record(GEOMETRIC, "a", [10.0, 20.0, 60.0], metric="psnr")]
-    made = grids(Results(protocol, pictures, (1, 3), ()))
+    made = grids(EvaluationResults(protocol, pictures, (1, 3), ()))
     running = find(made, "view source, mean over 1 window, and over t+1 to the horizon")
     assert running.heading == ("", "PSNR t+3", "s") and running.rows == ((GEOMETRIC, "30.00", "0.50"),)
 
@@ -81,7 +81,7 @@ def test_the_camera_is_held_against_constant_velocity() -> None:
 
 
 def test_one_clip_is_told_to_doubt() -> None:
-    made = grids(Results(PROTOCOLS["clip"], [record(GEOMETRIC, "a", [0.5])], (1,), ()))
+    made = grids(EvaluationResults(PROTOCOLS["clip"], [record(GEOMETRIC, "a", [0.5])], (1,), ()))
     (interval,) = [grid for grid in made if "interval" in grid.title]
     assert "too narrow" in interval.notes[0]
     assert not [grid for grid in made if "by clip" in grid.title]

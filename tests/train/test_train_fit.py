@@ -384,7 +384,7 @@ def fill_disk(monkeypatch: pytest.MonkeyPatch, full: tuple[int, ...]) -> None:
     """Checkpoints of these steps find no room."""
     save, write, step = checkpoint.save, write_checkpoint, [0]
 
-    def saving(out: Path | str, state: checkpoint.State, keep: int = 3) -> Path:
+    def saving(out: Path | str, state: checkpoint.TrainingState, keep: int = 3) -> Path:
         step[0] = state.step
         return save(out, state, keep)
 

@@ -9,7 +9,7 @@ from data_files import picture
 from kitti_trees import calibration
 
 from train.evaluation.protocols import HELD_OUT, NOW, PROTOCOLS, Name, Where, currents
-from train.evaluation.windows import PART_WINDOWS, Part, plan
+from train.evaluation.windows import PART_WINDOWS, ShardPart, plan
 from vestcl.bench.forecast.bench import HELD_OUT as BENCH_HELD_OUT
 from vestcl.data.readers.splits import KITTI_PREDICTION_TEST, KITTI_VIEWS_TEST, KITTI_VIEWS_VAL, windows
 from vestcl.evaluation.tables import METRICS
@@ -34,13 +34,13 @@ def empty_drives(root: Path, frames: Mapping[str, int]) -> Path:
     return root
 
 
-def parts_of(name: Name, data: Path | None, every: int = 1, seeds: range = HELD_OUT) -> list[Part]:
+def parts_of(name: Name, data: Path | None, every: int = 1, seeds: range = HELD_OUT) -> list[ShardPart]:
     protocol = PROTOCOLS[name]
     where = Where(data, seeds, protocol.size, 1 + (protocol.last or 1) + protocol.steps, 1)
     return plan(protocol.sources(where), protocol, protocol.steps, every, Path("kept"), "key")
 
 
-def count(parts: list[Part]) -> int:
+def count(parts: list[ShardPart]) -> int:
     return sum(len(part.indices) for part in parts)
 
 

@@ -12,7 +12,7 @@ import yaml
 from forecaster_scenes import SMALL
 
 from train import forecasts, refinement, refinement_scores
-from train.forecasts import Entry, Window, pack, unpack
+from train.forecasts import Entry, ForecastWindow, pack, unpack
 from train.refinement import LOG, STATE, RefinementConfig, Samples, load_config, train, with_forecast_refinement
 from train.run import trainer
 from vestcl.cli.prepare import open_input
@@ -105,7 +105,7 @@ def test_options_that_cannot_be(options: tuple[str, ...], message: str, tmp_path
     made = forecasts.Forecasts((STREET,), tmp_path, frames=6, horizons=(1, 2))
     values = {options[0].removeprefix("--"): (0,) if options[0] == "--horizons" else int(options[1])}
     with pytest.raises(ValueError, match=message):
-        forecasts.check(dataclasses.replace(made, **values))
+        forecasts.check_options(dataclasses.replace(made, **values))
 
 
 def test_a_damaged_window_is_named(cache: Path, tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_planes_and_target_are_varied_alike(tmp_path: Path) -> None:
     """Of a perfect forecast the target is the image, however cut, mirrored and coloured; grey is grey."""
     image = np.random.default_rng(0).integers(0, 256, (3, 40, 80)).astype(np.float32) / 255
     planes = np.concatenate([image, np.ones((4, 40, 80), np.float32)])
-    (tmp_path / "000000.npz").write_bytes(pack(Window("c", 2, [Entry(planes, image, 1)])))
+    (tmp_path / "000000.npz").write_bytes(pack(ForecastWindow("c", 2, [Entry(planes, image, 1)])))
     data = refinement.ForecastData((str(tmp_path),), (32, 64), colour=0.5, grey=1.0)
     got, target = Samples(data, 0).batch(0, 4)
     assert torch.equal(got[:, :3], target) and torch.equal(target[:, 0], target[:, 2])
@@ -150,7 +150,7 @@ def test_a_run_learns_and_keeps_all_other_parts(tmp_path: Path, cache: Path) -> 
     image = np.random.default_rng(0).uniform(0.2, 0.6, (3, 32, 64)).astype(np.float32)
     planes = np.concatenate([image, np.ones((4, 32, 64), np.float32)])
     (tmp_path / "dark").mkdir()
-    (tmp_path / "dark" / "000002.npz").write_bytes(pack(Window("dark", 2, [Entry(planes, image + 0.1, 1)])))
+    (tmp_path / "dark" / "000002.npz").write_bytes(pack(ForecastWindow("dark", 2, [Entry(planes, image + 0.1, 1)])))
     config = settings(tmp_path, tmp_path / "dark", "stage.steps=20", "stage.learning_rate=0.01")
     file = train(config, base=base())
     rows = [json.loads(line) for line in (config.out / LOG).read_text().splitlines()]
@@ -196,11 +196,11 @@ def test_a_run_starts_from_another_models_refinement(tmp_path: Path, cache: Path
     torch.nn.init.normal_(once.refine.out.weight)
     once.save(tmp_path / "one.safetensors")
     config = settings(tmp_path, cache, f"init={tmp_path / 'one.safetensors'}")
-    started = refinement.Training(config, base())
+    started = refinement.RefinementTraining(config, base())
     assert torch.equal(started.whole.refine.out.weight, once.refine.out.weight)
     base().save(tmp_path / "clouds.safetensors")
     with pytest.raises(ValueError, match="its refinement is of splatted clouds"):
-        refinement.Training(dataclasses.replace(config, init=str(tmp_path / "clouds.safetensors")), base())
+        refinement.RefinementTraining(dataclasses.replace(config, init=str(tmp_path / "clouds.safetensors")), base())
 
 
 def test_other_parts_train_on_from_such_a_model(tmp_path: Path) -> None:

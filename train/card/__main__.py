@@ -25,7 +25,7 @@ from train.command import ERRORS, failed, warnings_in_lines
 from train.evaluation.options import Evaluation
 from train.evaluation.protocols import PROTOCOLS
 from train.run import checkpoint
-from train.run.checkpoint import State
+from train.run.checkpoint import TrainingState
 from train.run.report import LOG, read_log
 from train.settings.config import Config, from_dict
 from vestcl import interrupt
@@ -178,7 +178,7 @@ def _read_results(path: Path) -> dict[str, Any]:
     raise ValueError(f"{path}: must be what train.evaluate writes, with {', '.join(_RESULTS)}; evaluate again")
 
 
-def _text(options: Card, state: State, rows: Rows, weights: Weights, results: Results) -> str:
+def _text(options: Card, state: TrainingState, rows: Rows, weights: Weights, results: Results) -> str:
     """README.md: the author's words with what the files tell."""
     config, machine = from_dict(state.config), options.machine
     if machine is None and results:

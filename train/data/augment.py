@@ -36,7 +36,7 @@ _MIRROR: Final = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class TrainingWindow:
     """Two frames of a clip and what is to be forecast from them, all of one size."""
 
     prev: Prepared
@@ -63,7 +63,7 @@ class Window:
         return height, width
 
 
-def crop(window: Window, top: int, left: int, height: int, width: int) -> Window:
+def crop(window: TrainingWindow, top: int, left: int, height: int, width: int) -> TrainingWindow:
     """The part that starts at (left, top): c_x - left, c_y - top; nothing else changes.
 
     Args:
@@ -91,7 +91,7 @@ def crop(window: Window, top: int, left: int, height: int, width: int) -> Window
     return _mapped(window, cut, cut, lambda K: geometry.crop_intrinsics(torch.from_numpy(K), left, top).numpy())
 
 
-def resize(window: Window, height: int, width: int) -> Window:
+def resize(window: TrainingWindow, height: int, width: int) -> TrainingWindow:
     """Everything at another size: K' = diag(s_x, s_y, 1) K; pictures by mean over area, all else the nearest pixel.
 
     Args:
@@ -118,7 +118,7 @@ def resize(window: Window, height: int, width: int) -> Window:
     )
 
 
-def flip(window: Window) -> Window:
+def flip(window: TrainingWindow) -> TrainingWindow:
     """The world in a mirror, x -> -x.
 
     With S = diag(-1, 1, 1): pictures mirrored left to right, K' = [[-1, 0, W], [0, 1, 0], [0, 0, 1]] K S, so that
@@ -195,7 +195,7 @@ def draw_colour(rng: np.random.Generator, strength: float, grey: float) -> Colou
     return Colour(float(np.exp(GAMMA * gamma)), matrix, float(factor * (1 - spread) * grey))
 
 
-def colour(window: Window, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> Window:
+def colour(window: TrainingWindow, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> TrainingWindow:
     """``change`` applied to every picture of a window: the frames', the backgrounds' and the target."""
     return _mapped(window, change, _same, _same)
 
@@ -213,8 +213,11 @@ def _hue_turn(angle: float) -> Matrix:
 
 
 def _mapped(
-    window: Window, picture: Callable[[Any], Any], planes: Callable[[Any], Any], intrinsics: Callable[[Matrix], Matrix]
-) -> Window:
+    window: TrainingWindow,
+    picture: Callable[[Any], Any],
+    planes: Callable[[Any], Any],
+    intrinsics: Callable[[Matrix], Matrix],
+) -> TrainingWindow:
     """The window with its pictures, its other planes (depths, masks, velocities) and its K changed."""
 
     def frame(frame: Prepared) -> Prepared:

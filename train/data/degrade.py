@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from train.data.augment import LUMA, Matrix, Window
+from train.data.augment import LUMA, Matrix, TrainingWindow
 from train.settings.config import DegradeConfig
 from vestcl.prepare.frame import Prepared
 
@@ -75,7 +75,7 @@ def draw(rng: np.random.Generator, settings: DegradeConfig) -> Degradation | Non
     )
 
 
-def blur(window: Window, later: Prepared, shutter: float) -> Window:
+def blur(window: TrainingWindow, later: Prepared, shutter: float) -> TrainingWindow:
     """Frames and target blurred along what they show moves: the mean over tau in shutter [-1/2, 1/2] of I(p + tau u).
 
     u = project(K (R (x - v) + t)) - p is the flow to the frame before, from depth, camera motion and the velocity v of
@@ -99,7 +99,7 @@ def blur(window: Window, later: Prepared, shutter: float) -> Window:
     )
 
 
-def degrade(window: Window, done: Degradation, rng: np.random.Generator) -> Window:
+def degrade(window: TrainingWindow, done: Degradation, rng: np.random.Generator) -> TrainingWindow:
     """All but the blur: see the module for what is done to the target.
 
     Args:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
 from train.data import augment, degrade
-from train.data.augment import Window
+from train.data.augment import TrainingWindow
 from train.settings.config import DegradeConfig
 from vestcl.forecasting.network.input import PAST, CameraPath, NetworkInput, camera_path, last_motions, network_input
 from vestcl.models.networks.layers import joined
@@ -218,7 +218,7 @@ class WindowSet:
             given.own,
         )
 
-    def window(self, draw: Draw) -> Window:
+    def window(self, draw: Draw) -> TrainingWindow:
         """The window as the clip has it, not augmented."""
         clip, later = self.clips[draw.clip], draw.frame + draw.horizon
         prev, cur = clip.frame(draw.frame - 1), clip.frame(draw.frame)
@@ -228,9 +228,9 @@ class WindowSet:
         here, there = clip.world_from_cam(draw.frame), clip.world_from_cam(later)
         future_from_cur = None if here is None or there is None else np.asarray(np.linalg.inv(there) @ here, np.float64)
         path = self._path_of(draw.clip, draw.frame) if self.prior == "forecast" else None
-        return Window(prev, cur, image, K, tgt_from_next, future_from_cur, self._poses(clip, draw.frame), path)
+        return TrainingWindow(prev, cur, image, K, tgt_from_next, future_from_cur, self._poses(clip, draw.frame), path)
 
-    def augmented(self, window: Window, rng: np.random.Generator) -> Window:
+    def augmented(self, window: TrainingWindow, rng: np.random.Generator) -> TrainingWindow:
         """Cut out, shrunk, mirrored and coloured as the settings say, by numbers from ``rng``."""
         (rows, columns), (share, down, across, side) = window.size, rng.random(4)
         scale = self.scale[0] + (self.scale[1] - self.scale[0]) * share
@@ -278,7 +278,7 @@ class WindowSet:
             return ()
         return tuple(np.asarray(np.linalg.inv(pose) @ known[0], np.float64) for pose in known[1:])
 
-    def _path(self, window: Window) -> torch.Tensor:
+    def _path(self, window: TrainingWindow) -> torch.Tensor:
         return _matrices(window.path_from_cur or [np.eye(4)] * len(self.horizons))
 
     def _draw(self, seed: int, position: int, horizon: int) -> Draw:
@@ -293,7 +293,7 @@ class WindowSet:
         right = bool(np.random.default_rng([seed, _VIEW, position]).random() < self.right)
         return Draw(clip, index, horizon, right, (seed, _AUGMENT, position))
 
-    def _made(self, draw: Draw) -> tuple[NetworkInput, Window]:
+    def _made(self, draw: Draw) -> tuple[NetworkInput, TrainingWindow]:
         try:
             window, rng = self.window(draw), np.random.default_rng([draw.seed[0], _DEGRADE, *draw.seed[2:]])
             done = None if self.degrade is None else degrade.draw(rng, self.degrade)

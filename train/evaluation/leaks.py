@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from train.evaluation.windows import Part
+from train.evaluation.windows import ShardPart
 from vestcl.models.checkpoint import read_trained_on
 
 Sentences = tuple[str, ...]
@@ -13,7 +13,7 @@ Sentences = tuple[str, ...]
 _LISTED: Final = 8
 
 
-def training_overlap(models: Sequence[Path], parts: Sequence[Part], steps: int) -> tuple[Sentences, Sentences]:
+def training_overlap(models: Sequence[Path], parts: Sequence[ShardPart], steps: int) -> tuple[Sentences, Sentences]:
     """Sentences for the tables: on models that were trained on what is evaluated, and on those that may have been.
 
     Args:
@@ -41,6 +41,6 @@ def training_overlap(models: Sequence[Path], parts: Sequence[Part], steps: int) 
     return tuple(leaks), tuple(unknown)
 
 
-def _overlap(part: Part, frames: tuple[int, int] | None, steps: int) -> bool:
+def _overlap(part: ShardPart, frames: tuple[int, int] | None, steps: int) -> bool:
     """Whether a window of the part shows one of these frames, the first to the last."""
     return frames is not None and any(t - 1 <= frames[1] and frames[0] <= t + steps for t in part.indices)

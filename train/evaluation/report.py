@@ -42,7 +42,7 @@ DISTANCE: Final = ("lpips", "st_lpips", "squeeze")
 
 
 @dataclass(frozen=True)
-class Results:
+class EvaluationResults:
     """An evaluation that is done."""
 
     protocol: Protocol
@@ -87,7 +87,7 @@ def headline(records: Sequence[Record]) -> list[str]:
 # ---------------------------------------------------------------- tables
 
 
-def grids(results: Results) -> list[Grid]:
+def grids(results: EvaluationResults) -> list[Grid]:
     """All tables: by horizon, differences, the paper's, running means, intervals, by clip."""
     name, records, horizons = results.protocol.title, results.records, results.horizons
     pictures = [record for record in records if record.first == 1 and "psnr" in record.scores]
@@ -99,7 +99,7 @@ def grids(results: Results) -> list[Grid]:
     return [*short_grids(results), *(_with_notes(grid, results) for grid in further)]
 
 
-def short_grids(results: Results) -> list[Grid]:
+def short_grids(results: EvaluationResults) -> list[Grid]:
     """Those that a terminal has room for: by horizon, differences, the paper's."""
     name = results.protocol.title
     shown = picture_grids(name, results.records, results.horizons)
@@ -107,7 +107,7 @@ def short_grids(results: Results) -> list[Grid]:
     return own + _paper_grids(results)
 
 
-def _with_notes(grid: Grid, results: Results) -> Grid:
+def _with_notes(grid: Grid, results: EvaluationResults) -> Grid:
     """With notes on inputs, on how the models made later frames, and on models that were trained on what is evaluated,
     once."""
     modes, perceived = (
@@ -122,12 +122,12 @@ def _with_notes(grid: Grid, results: Results) -> Grid:
     return replace(grid, notes=(*grid.notes, *(note for note in own if note not in grid.notes)))
 
 
-def _interval_grid(view: str, records: Sequence[Record], results: Results) -> Grid:
+def _interval_grid(view: str, records: Sequence[Record], results: EvaluationResults) -> Grid:
     title = f"{results.protocol.title}, view {view}, mean and 95 % interval"
     return interval_grid(title, records, results.horizons, headline(records))
 
 
-def _difference_grids(results: Results) -> list[Grid]:
+def _difference_grids(results: EvaluationResults) -> list[Grid]:
     made = []
     for view, of_view in by_view(results.records).items():
         methods = {method: own for (_, method), own in by_method(of_view).items()}
@@ -151,7 +151,7 @@ def _baseline(method: str, methods: Collection[str]) -> str | None:
     return next((name for name in (base + label_of(method) for base in _BASELINES) if name in methods), None)
 
 
-def _clip_grids(results: Results) -> list[Grid]:
+def _clip_grids(results: EvaluationResults) -> list[Grid]:
     """A row a clip."""
     made = []
     for view, of_view in by_view(results.records).items():
@@ -176,7 +176,7 @@ def _of_clip(records: Sequence[Record], clip: str, method: str, metric: str, ste
     return number(means([record.scores for record in own])[metric][step - own[0].first], METRICS[metric].digits)
 
 
-def _paper_grids(results: Results) -> list[Grid]:
+def _paper_grids(results: EvaluationResults) -> list[Grid]:
     rows = results.protocol.paper
     if not rows:
         return []
@@ -195,7 +195,7 @@ def _paper_grids(results: Results) -> list[Grid]:
 # ---------------------------------------------------------------- files
 
 
-def markdown(results: Results, about: Sequence[str]) -> str:
+def markdown(results: EvaluationResults, about: Sequence[str]) -> str:
     """results.md.
 
     Args:
@@ -219,7 +219,7 @@ def table_of_windows(records: Sequence[Record]) -> str:
     return text.getvalue()
 
 
-def as_json(results: Results, about: Mapping[str, Any]) -> dict[str, Any]:
+def as_json(results: EvaluationResults, about: Mapping[str, Any]) -> dict[str, Any]:
     """results.json: everything.
 
     Args:
@@ -248,7 +248,7 @@ def as_json(results: Results, about: Mapping[str, Any]) -> dict[str, Any]:
     return checked
 
 
-def _all_differences(results: Results) -> dict[tuple[str, str], dict[str, list[Difference]]]:
+def _all_differences(results: EvaluationResults) -> dict[tuple[str, str], dict[str, list[Difference]]]:
     """Of each model from the geometric forecast, or from constant velocity."""
     groups = by_method(results.records)
     found = {}

@@ -61,7 +61,7 @@ AS_SEEN: Final = f"unchanged{OTHER_CAMERA}"
 
 
 @dataclass(frozen=True)
-class Part:
+class ShardPart:
     """Windows of one clip that are done in one go."""
 
     source: Source
@@ -71,7 +71,9 @@ class Part:
     """Where the scores are kept."""
 
 
-def plan(sources: Iterable[Source], protocol: Protocol, steps: int, every: int, folder: Path, key: str) -> list[Part]:
+def plan(
+    sources: Iterable[Source], protocol: Protocol, steps: int, every: int, folder: Path, key: str
+) -> list[ShardPart]:
     """All parts, in the order of clips and windows; of all clips' windows counted through, every ``every``-th. Windows
     whose future has a gap are left out.
 
@@ -88,7 +90,7 @@ def plan(sources: Iterable[Source], protocol: Protocol, steps: int, every: int, 
     """
     if every < 1:
         raise ValueError(f"`every` must be 1 or more, got {every}")
-    parts, count = list[Part](), 0
+    parts, count = list[ShardPart](), 0
     for source in sources:
         clip = source.opens()
         known = [t for t in currents(len(clip), steps, protocol.first, protocol.last) if clip.is_whole(t, steps)]
@@ -100,11 +102,11 @@ def plan(sources: Iterable[Source], protocol: Protocol, steps: int, every: int, 
         name = re.sub(r"[^A-Za-z0-9_.-]+", "_", source.name)
         for at in range(0, len(chosen), PART_WINDOWS):
             indices = tuple(chosen[at : at + PART_WINDOWS])
-            parts.append(Part(source, indices, folder / f"{name}-{indices[0]:06d}-{key}.json"))
+            parts.append(ShardPart(source, indices, folder / f"{name}-{indices[0]:06d}-{key}.json"))
     return parts
 
 
-def run_part(part: Part, setup: Setup, advance: Callable[[], None] = lambda: None) -> None:
+def run_part(part: ShardPart, setup: Setup, advance: Callable[[], None] = lambda: None) -> None:
     """Forecast and score a part's windows, and write its file.
 
     Args:
@@ -129,7 +131,7 @@ def run_part(part: Part, setup: Setup, advance: Callable[[], None] = lambda: Non
     write_bytes(part.file, json.dumps(content).encode())
 
 
-def read_part(part: Part) -> list[Record] | None:
+def read_part(part: ShardPart) -> list[Record] | None:
     """What `run_part` wrote; None where the part is not done.
 
     Raises:
@@ -138,7 +140,7 @@ def read_part(part: Part) -> list[Record] | None:
     return _read(part, lambda content: [Record(**record) for record in content["records"]])
 
 
-def read_inputs(part: Part) -> dict[str, Inputs] | None:
+def read_inputs(part: ShardPart) -> dict[str, Inputs] | None:
     """What the part's frames were preprocessed with, by the label of rows; None where the part is not done.
 
     Raises:
@@ -147,7 +149,7 @@ def read_inputs(part: Part) -> dict[str, Inputs] | None:
     return _read(part, lambda content: {ending: Inputs.read(of) for ending, of in content["inputs"].items()})
 
 
-def _read(part: Part, take: Callable[[Any], Made]) -> Made | None:
+def _read(part: ShardPart, take: Callable[[Any], Made]) -> Made | None:
     if not part.file.is_file():
         return None
     try:

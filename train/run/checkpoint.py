@@ -67,7 +67,7 @@ def package_versions() -> dict[str, str]:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class TrainingState:
     """All that a run needs to go on as if it had never stopped."""
 
     step: int
@@ -103,7 +103,7 @@ def list_checkpoints(out: Path | str) -> list[Path]:
     return sorted(found, key=_step, reverse=True)
 
 
-def save(out: Path | str, state: State, keep: int = 3) -> Path:
+def save(out: Path | str, state: TrainingState, keep: int = 3) -> Path:
     """Write ``state`` beneath ``out`` and remove all that is older than the newest ``keep`` intact checkpoints.
 
     Once the new one is there, nothing about the old ones is an error: what can't be removed is named in a warning.
@@ -146,7 +146,7 @@ def save(out: Path | str, state: State, keep: int = 3) -> Path:
     return path
 
 
-def load_latest(out: Path | str) -> State | None:
+def load_latest(out: Path | str) -> TrainingState | None:
     """The newest intact checkpoint; a warning names each damaged one that is newer, and what is wrong with it.
 
     Args:
@@ -174,7 +174,7 @@ def _step(path: Path) -> int:
     return int(path.name.removeprefix("step-"))
 
 
-def _packed(state: State) -> bytes:
+def _packed(state: TrainingState) -> bytes:
     """All but the weights, as `torch.save` writes it; read back once, for a checkpoint that can't be read is none."""
     names = ("step", "config", "optimiser", "scheduler", "rng", "versions", "extra", "recent", "trained_on")
     file = io.BytesIO()
@@ -192,7 +192,7 @@ def _unpacked(file: io.BytesIO) -> dict[str, Any]:
     return torch.load(file, map_location="cpu", weights_only=True)
 
 
-def _write(folder: Path, state: State, rest: bytes) -> None:
+def _write(folder: Path, state: TrainingState, rest: bytes) -> None:
     """All files of a checkpoint, on the disk when this returns."""
     write_checkpoint(folder / _MODEL, state.model_config, state.model, state.trained_on)
     if state.ema is not None:
@@ -255,12 +255,12 @@ def _remove(path: Path) -> None:
         warnings.warn(f"old checkpoint {path} can't be removed: {error.strerror or error}", stacklevel=2)
 
 
-def _read(path: Path) -> State:
+def _read(path: Path) -> TrainingState:
     files = _verified(path)
     rest = _unpacked(io.BytesIO((path / _STATE).read_bytes()))
     model_config, model = read_checkpoint(path / _MODEL)
     ema = read_checkpoint(path / _EMA)[1] if _EMA in files else None
-    return State(model_config=model_config, model=model, ema=ema, **rest)
+    return TrainingState(model_config=model_config, model=model, ema=ema, **rest)
 
 
 def _verified(path: Path, digest: Callable[[Path], str] = sha256) -> dict[str, Any]:

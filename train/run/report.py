@@ -15,7 +15,7 @@ from torch.utils.tensorboard import SummaryWriter
 from train.data.windows import Batch
 from train.run.trainer import Update
 from train.settings.config import Config
-from vestcl.cli.progress import Bar
+from vestcl.cli.progress import ProgressBar
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.atomic import write_bytes
 from vestcl.io.images import write_pixels
@@ -64,7 +64,7 @@ class Reporter:
         """A bar from ``step`` to the run's end."""
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         drawn = self._speaks and self.console.is_terminal
-        with Bar(*columns, TimeRemainingColumn(), console=self.console, disable=not drawn) as self._bar:
+        with ProgressBar(*columns, TimeRemainingColumn(), console=self.console, disable=not drawn) as self._bar:
             self._task = self._bar.add_task("", total=self._config.steps, completed=step)
             try:
                 yield

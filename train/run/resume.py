@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from train.run.checkpoint import State, package_versions
+from train.run.checkpoint import TrainingState, package_versions
 from train.settings.config import Config, from_dict, to_dict
 
 #: Keys that may change on the way: none of them is a part of what was learnt so far.
@@ -14,7 +14,7 @@ _FREE: Final = re.compile(r"((run|out|data\.workers|stages\.\d+\.data\.workers)(
 _OF_STAGE: Final = re.compile(r"stages\.(\d+)\.(.*)")
 
 
-def check_resume(state: State, config: Config) -> None:
+def check_resume(state: TrainingState, config: Config) -> None:
     """Whether ``config`` goes on with what ``state`` began. Other versions of packages are warned of.
 
     ``run``, ``out`` and the number of workers may change. So may the steps of stages that are not over and of the last

@@ -111,7 +111,7 @@ def _check_remembered(options: Forecast) -> None:
         raise ValueError("`memory` is of the geometric forecast: it can't be combined with `model`")
 
 
-def check(options: Forecast) -> None:
+def check_forecast(options: Forecast) -> None:
     """Refuse options that need others.
 
     Raises:

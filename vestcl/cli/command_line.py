@@ -50,7 +50,7 @@ def subcommand(kinds: Mapping[str, Callable[..., Any]], prog: str, arguments: Se
     parsed = tyro.extras.subcommand_cli_from_dict(
         dict(kinds), prog=prog, description=about or None, args=list(arguments)
     )
-    options.check(parsed)
+    options.check_options(parsed)
     return parsed
 
 
@@ -70,7 +70,7 @@ def parsed(kind: type[Options], prog: str, about: str | None, arguments: Sequenc
     try:
         options.check_arguments(given)
         config = tyro.cli(kind, prog=prog, description=about, args=given)
-        options.check(config)
+        options.check_options(config)
     except (ValueError, OSError) as error:
         print_error(f"error: {in_words(error)}")
         raise SystemExit(REFUSED) from error

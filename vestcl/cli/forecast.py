@@ -18,7 +18,7 @@ from rich.text import Text
 from vestcl import opencl
 from vestcl.cli import checks, commands
 from vestcl.cli.clip import load_estimators, open_clip
-from vestcl.cli.progress import Bar
+from vestcl.cli.progress import ProgressBar
 from vestcl.data.sample import Clip
 from vestcl.evaluation import compare
 from vestcl.evaluation.compare import Comparison
@@ -26,7 +26,7 @@ from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.forecasting import files as forecast_files
 from vestcl.forecasting.network.later_frames import LaterFrames, later_frames
-from vestcl.forecasting.result import Forecast, Skipped, View
+from vestcl.forecasting.result import Forecast, SkippedWork, View
 from vestcl.forecasting.sheets import forecast_sheet
 from vestcl.forecasting.views import parse_views
 from vestcl.models.inference import pretrained, quality
@@ -52,7 +52,7 @@ DEFAULT_LEARNED: Final = "tested"
 class _Stages:
     """The bar on the terminal, and how long each stage took."""
 
-    bar: Bar
+    bar: ProgressBar
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -78,10 +78,10 @@ def run(options: commands.Forecast) -> None:
         ValueError: an option out of range, or a file that is missing or malformed; the message names it.
         DeviceError: no such OpenCL device.
     """
-    checks.check(options)
+    checks.check_forecast(options)
     console = Console()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    bar = Bar(*columns, console=console, transient=True, disable=not console.is_terminal)
+    bar = ProgressBar(*columns, console=console, transient=True, disable=not console.is_terminal)
     with opencl.use(options.device), bar:
         stages = _Stages(bar)
         with stages.stage("open the clip"):
@@ -275,7 +275,7 @@ def _print_end(console: Console, saved: forecast_files.SavedForecast) -> None:
     for switch, one in saved.about.get("skipped", {}).items():
         if one["skipped"]:
             console.print(
-                Text(f"skipped, {switch}: {Skipped(*(one[name] for name in Skipped._fields))}"), soft_wrap=True
+                Text(f"skipped, {switch}: {SkippedWork(*(one[name] for name in SkippedWork._fields))}"), soft_wrap=True
             )
     for part, one in saved.about.get("learned", {}).items():
         console.print(

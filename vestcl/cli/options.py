@@ -141,7 +141,7 @@ def check_arguments(arguments: Sequence[str]) -> None:
             raise ValueError(f"{option} must not have a zero byte, got {text!r}")
 
 
-def check(options: Any) -> None:
+def check_options(options: Any) -> None:
     """Hold every number against its range, and every file and folder to be written against what is there.
 
     Args:

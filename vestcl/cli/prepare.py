@@ -17,7 +17,7 @@ from vestcl import interrupt
 from vestcl.cli.checks import check_file_options, is_network_file
 from vestcl.cli.clip import open_clip
 from vestcl.cli.commands import Prepare
-from vestcl.cli.progress import Bar
+from vestcl.cli.progress import ProgressBar
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
 from vestcl.prepare.clip import Outcome, Report, prepare_clip
@@ -55,7 +55,7 @@ def run(options: Prepare) -> None:
     console = Console()
     hidden = not console.is_terminal or os.environ.get("LOCAL_RANK", "0") != "0"  # one bar a terminal
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Bar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden)
+    bar = ProgressBar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden)
     told, done, total = Told(), 0, sum(task.frames for task in tasks)
     with interrupt.summary(lambda: _stopped(done, total)), bar:
         shown = bar.add_task("frames", total=total)

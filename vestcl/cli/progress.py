@@ -3,7 +3,7 @@
 from rich.progress import Progress
 
 
-class Bar(Progress):
+class ProgressBar(Progress):
     """rich's bar; a disabled one prints nothing, not even the empty line that rich before 14.3 ends it with."""
 
     def stop(self) -> None:

@@ -33,7 +33,7 @@ class Rendered:
     its own time's source camera; 0 where unknown."""
 
 
-class Skipped(NamedTuple):
+class SkippedWork(NamedTuple):
     """What a network did not compute, because the scene did not need it."""
 
     skipped: int
@@ -79,7 +79,7 @@ class Forecast:
     """Time by stage."""
     profile: dict[str, float] = field(default_factory=dict)
     """A network's seconds by stage; they are in ``seconds``, too, as one number."""
-    skipped: dict[str, Skipped] = field(default_factory=dict)
+    skipped: dict[str, SkippedWork] = field(default_factory=dict)
     """By switch of `vestcl.models.inference.skipping.Skip`."""
     notes: tuple[str, ...] = ()
     """Lines for the user: what was left out, and why."""

@@ -20,7 +20,7 @@ from vestcl.models.networks.refine import Refine
 from vestcl.models.steps.clouds import Cloud, as_image, join, lift, lift_hidden
 from vestcl.models.steps.encode import encode
 from vestcl.models.steps.frames import EncodedFrame, grid_depth, grid_mean, with_depth
-from vestcl.models.steps.memory import Memory, State
+from vestcl.models.steps.memory import EncodedFrames, State
 from vestcl.models.steps.motion import Motion, flattened, without_z
 from vestcl.models.steps.move_objects import move_objects, unmoved
 from vestcl.models.steps.prior import MotionPrior, beside
@@ -62,7 +62,7 @@ class Stages(nn.Module):
         #: What is computed more coarsely than the network was trained to.
         self.effort = Effort()
         #: The frames that were encoded last.
-        self.memory = Memory()
+        self.memory = EncodedFrames()
 
     @property
     def flat(self) -> bool:

@@ -1,6 +1,6 @@
 """What every operator does with its arguments before a kernel sees them: check, convert, and split into work-items.
 
-An operator opens with one `check`, which binds the letters of its shapes and refuses everything else::
+An operator opens with one `check_arguments`, which binds the letters of its shapes and refuses everything else::
 
     sizes = check(depth=(depth, "B 1 H W"), K=(K, "B 3 3"))
     output = np.empty((sizes["B"], sizes["H"] * sizes["W"], 3), as_array(depth).dtype)
@@ -28,7 +28,7 @@ CPU_CHUNK: Final = 2048
 GPU_GROUP: Final = 64
 
 
-def check(**arguments: tuple[Any, str]) -> dict[str, int]:
+def check_arguments(**arguments: tuple[Any, str]) -> dict[str, int]:
     """Hold operator arguments against their shapes; the sizes that the letters stand for.
 
     Args:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from vestcl import opencl
-from vestcl.ops._arguments import Array, as_array, check, require_no_grad, require_ordinary, work_items
+from vestcl.ops._arguments import Array, as_array, check_arguments, require_no_grad, require_ordinary, work_items
 from vestcl.ops._autograd import differentiable_by, untraced
 
 
@@ -37,7 +37,7 @@ def displace(
 
     Source: SPEC section 2; the forward 3D displacement of the paper.
     """
-    check(
+    check_arguments(
         points_xyz=(points_xyz, "B N 3"),
         displacement_xyz=(displacement_xyz, "B N 3"),
         K=(K, "B 3 3"),

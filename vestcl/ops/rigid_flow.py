@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from vestcl import constants, geometry, opencl
-from vestcl.ops._arguments import Array, as_array, check, require_ordinary, work_items
+from vestcl.ops._arguments import Array, as_array, check_arguments, require_ordinary, work_items
 from vestcl.ops._autograd import Gradients, differentiable_by, untraced
 
 #: Partial sums per image in the gradient of the motion, the same on every device and so the same order of additions.
@@ -35,7 +35,7 @@ def rigid_flow(points_xyz: Array, quaternion: Array, translation: Array) -> Arra
 
     Source: SPEC section 2; the rigid flow of the paper's ego-motion forecasting.
     """
-    check(points_xyz=(points_xyz, "B N 3"), quaternion=(quaternion, "B 4"), translation=(translation, "B 3"))
+    check_arguments(points_xyz=(points_xyz, "B N 3"), quaternion=(quaternion, "B 4"), translation=(translation, "B 3"))
     if not isinstance(points_xyz, torch.Tensor):
         return _forward(opencl.current(), as_array(points_xyz), as_array(quaternion), as_array(translation))
     return _RigidFlow.apply(points_xyz, quaternion, translation)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from vestcl import constants, opencl
-from vestcl.ops._arguments import Array, as_array, check, check_starts, require_no_grad, require_ordinary
+from vestcl.ops._arguments import Array, as_array, check_arguments, check_starts, require_no_grad, require_ordinary
 from vestcl.ops._autograd import Gradients, differentiable_once, untraced
 from vestcl.ops._splat_composite import Layer, Wanted, composite_backward, composite_forward
 from vestcl.ops._splat_lists import Geometry, TileLists, list_tiles
@@ -133,7 +133,7 @@ def rasterize(
     """
     require_no_grad("z", z)
     letters = "B N" if cloud_starts is None else "P"
-    sizes = check(
+    sizes = check_arguments(
         points_uv=(points_uv, f"{letters} 2"),
         z=(z, letters),
         radii=(radii, letters),
@@ -170,8 +170,8 @@ def composite(
     """
     letters = "P C" if raster.packed else "B N C"
     shapes = {"raster.points_uv": (raster.points_uv, letters.replace("C", "2")), "features": (features, letters)}
-    channels = check(**shapes)["C"]
-    check(**shapes, backgrounds=(backgrounds, f"{raster.geometry.batch} {channels} | None"))
+    channels = check_arguments(**shapes)["C"]
+    check_arguments(**shapes, backgrounds=(backgrounds, f"{raster.geometry.batch} {channels} | None"))
     if not 1 <= channels <= constants.MAX_CHANNELS:
         raise ValueError(f"`features` must have 1 to {constants.MAX_CHANNELS} channels, got {channels}")
     if not 0 <= min_transmittance < 1:

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from vestcl import constants, opencl
-from vestcl.ops._arguments import Array, as_array, check, work_items
+from vestcl.ops._arguments import Array, as_array, check_arguments, work_items
 from vestcl.ops._autograd import untraced
 
 
@@ -37,7 +37,7 @@ def stretch(points_uv: Array, magnified: Array) -> tuple[Array, Array]:
     Source: `constants.TORN`, `SLANTED`, `BENT`; Zwicker et al., Surface Splatting, SIGGRAPH 2001, has the
     footprint's general form.
     """
-    check(points_uv=(points_uv, "B H W 2"), magnified=(magnified, "B H W"))
+    check_arguments(points_uv=(points_uv, "B H W 2"), magnified=(magnified, "B H W"))
     factor, opacity = _stretch(opencl.current(), as_array(points_uv), as_array(magnified))
     if isinstance(points_uv, torch.Tensor):
         return torch.from_numpy(factor), torch.from_numpy(opacity)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from vestcl import opencl
-from vestcl.ops._arguments import Array, as_array, check, require_no_grad, require_ordinary, work_items
+from vestcl.ops._arguments import Array, as_array, check_arguments, require_no_grad, require_ordinary, work_items
 from vestcl.ops._autograd import untraced
 
 
@@ -28,7 +28,7 @@ def unproject(depth: Array, K: Array) -> Array:
 
     Source: SPEC section 2.
     """
-    check(depth=(depth, "B 1 H W"), K=(K, "B 3 3"))
+    check_arguments(depth=(depth, "B 1 H W"), K=(K, "B 3 3"))
     if not isinstance(depth, torch.Tensor):
         return _forward(opencl.current(), as_array(depth), _inverse(as_array(K)))
     require_no_grad("K", K)

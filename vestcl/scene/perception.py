@@ -20,7 +20,7 @@ from vestcl.scene.depth.lidar import densify
 from vestcl.scene.depth.stereo import stereo_depth
 from vestcl.scene.estimators.sources import EstimatedFrame
 from vestcl.scene.flow.correspondence import Correspondence, correspond
-from vestcl.scene.flow.parallax import View, refine_depth
+from vestcl.scene.flow.parallax import OtherFrame, refine_depth
 from vestcl.scene.inpainting.inpaint import DEFAULT, inpaint_background
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 from vestcl.scene.layers import Layers, without_gaps
@@ -220,14 +220,14 @@ class Perception:
         """The frame's layers and things."""
         return self.once("layers", index, lambda: self._see(index))
 
-    def frame(self, index: int) -> backtest.Frame:
+    def frame(self, index: int) -> backtest.BacktestFrame:
         """The frame as candidate motions of its points are made and tested; at frame 0 nothing came from anywhere."""
         surface, K, image = self.surface(index), self.clip[index].K, self.image(index)
         asked = image, surface.depth, self.moving(index).velocity
         if index == 0:
-            return backtest.Frame(*asked, np.zeros_like(image[:2]), np.eye(4), K)
+            return backtest.BacktestFrame(*asked, np.zeros_like(image[:2]), np.eye(4), K)
         motion = self._flow(index).flow_uv, self.prev_from_cur(index)
-        return backtest.Frame(*asked, *motion, K, self.clip.elapsed(index))
+        return backtest.BacktestFrame(*asked, *motion, K, self.clip.elapsed(index))
 
     def _flow(self, index: int) -> Correspondence:
         """From frame ``index`` to the one before; on the road only what the image can show."""
@@ -431,7 +431,7 @@ class Perception:
     def _complete(self, index: int) -> NDArray[np.float32]:
         mask, depth, own = self.mask(index), self.raw_depth(index), self.own(index)
         if index > 0 and not self.is_monocular(index):
-            view = View(self.correspondence(index), self.prev_from_cur(index))
+            view = OtherFrame(self.correspondence(index), self.prev_from_cur(index))
             depth = refine_depth(depth, self.inverse_std(index), self.clip[index].K, [view], mask & ~own)
         same = depth is self.raw_depth(index) or (
             self.clip[index].right is not None and self._given_depth(index) is None

@@ -21,7 +21,7 @@ from vestcl.bench.forecast import open_pixels
 from vestcl.constants import SKY_DEPTH
 from vestcl.data import Street, intrinsics
 from vestcl.data.open import open_sequence
-from vestcl.data.street.raycast import SKY_DEPTH as STREET_SKY
+from vestcl.data.street.raycast import STREET_SKY_DEPTH as STREET_SKY
 from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.st_lpips import Option as StLpipsOption
 from vestcl.io.labels import background

@@ -16,7 +16,7 @@ from vestcl.bench.forecast.truth import Facts
 from vestcl.bench.forecast.windows_list import Listed, read_list
 from vestcl.cli.checks import check_input
 from vestcl.cli.clip import load_estimators, with_estimates
-from vestcl.cli.progress import Bar
+from vestcl.cli.progress import ProgressBar
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
@@ -161,7 +161,7 @@ def run(groups: Sequence[Group], config: ForecastBench, networks: Networks, kept
         ValueError: as the readers and forecasts; a window can't be kept.
     """
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Bar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal)
+    bar = ProgressBar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal)
     with bar:
         task = bar.add_task("windows", total=sum(len(chosen) for group in groups for _, chosen in group.clips))
         for group in groups:

@@ -16,7 +16,7 @@ from vestcl.data.sample import Clip, Sample
 from vestcl.data.street.clip import Shot, StreetImage
 from vestcl.evaluation import metrics
 from vestcl.evaluation.motion import ego_errors, true_motion
-from vestcl.forecasting.geometric.render import Cloud, show
+from vestcl.forecasting.geometric.render import FrameCloud, show
 from vestcl.forecasting.result import Forecast
 from vestcl.io.labels import SKY, background
 
@@ -131,7 +131,7 @@ def splatter_alone(clip: Clip, index: int) -> dict[str, list[float]]:
     return {name: [value] for name, value in (values | {"seen": float(mask.double().mean())}).items()}
 
 
-def _true_clouds(cur: Sample, after: Sample) -> list[Cloud]:
+def _true_clouds(cur: Sample, after: Sample) -> list[FrameCloud]:
     """What the frame shows, and what stands behind its foreground, where they are one frame on."""
     taken = _taken(cur)
     behind = Shot(taken.street, taken.t, taken.aside, taken.size, taken.samples, foreground=False).take()
@@ -145,12 +145,12 @@ def _true_clouds(cur: Sample, after: Sample) -> list[Cloud]:
     ]
 
 
-def _cloud(colour: NDArray[np.float32], points: Array, moved: Array, which: NDArray[np.bool_]) -> Cloud:
+def _cloud(colour: NDArray[np.float32], points: Array, moved: Array, which: NDArray[np.bool_]) -> FrameCloud:
     """The pixels of ``which`` [H, W]."""
     rows, columns = np.nonzero(which)
     there, came = (each[:, rows, columns].T.astype(np.float32) for each in (moved, moved - points))
     z_src = points[2, rows, columns].astype(np.float32)
-    return Cloud(there, z_src, colour, came, rows, columns)
+    return FrameCloud(there, z_src, colour, came, rows, columns)
 
 
 def _motion(cur: Sample, after: Sample) -> NDArray[np.float32]:

@@ -22,7 +22,7 @@ from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.timing import Spread
 from vestcl.data import Frame, Street, intrinsics
-from vestcl.data.street.raycast import SKY_DEPTH
+from vestcl.data.street.raycast import STREET_SKY_DEPTH
 from vestcl.io.labels import background
 from vestcl.models import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster, Step
@@ -182,7 +182,7 @@ def street_frames(height: int, width: int, seed: int, count: int = 3) -> tuple[l
 
 def street_layers(frame: Frame) -> LayerBatch:
     """Layers [1, ...] of a street's frame, from its true depth and labels."""
-    sky = frame.depth[0] >= SKY_DEPTH
+    sky = frame.depth[0] >= STREET_SKY_DEPTH
     return layers.batch([layers.build_layers(frame.colour[0], frame.depth[0], background(frame.labels[0]), sky=sky)])
 
 

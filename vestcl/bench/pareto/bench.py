@@ -19,7 +19,7 @@ from vestcl.bench.pareto.front import PRICE, front, knee
 from vestcl.bench.pareto.knobs import EXACT, Knob, Setting, combinations, describe, knobs
 from vestcl.bench.pareto.measure import Bench, measure, recursions
 from vestcl.bench.pareto.scenes import scene
-from vestcl.cli.progress import Bar
+from vestcl.cli.progress import ProgressBar
 from vestcl.models.inference import pretrained, quality
 from vestcl.models.inference.fast import accelerate
 
@@ -82,7 +82,7 @@ def main(config: ParetoBench) -> None:
     console = _results.console()
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with (
-        Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
+        ProgressBar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
         _timing.torch_threads(config.threads),
         _timing.recycling_allocator(),
     ):

@@ -20,7 +20,7 @@ from vestcl.evaluation import metrics
 from vestcl.forecasting.network.input import NetworkInput
 from vestcl.models.forecaster import Forecaster, Mode
 from vestcl.models.inference.skipping import NOTHING
-from vestcl.models.steps.memory import Memory
+from vestcl.models.steps.memory import EncodedFrames
 
 Tell = Callable[[str], None]
 
@@ -34,7 +34,7 @@ class Bench:
     runs: int
     references: list[torch.Tensor] = field(default_factory=list)
     """[1, 3, H, W] float64 of each street: computed in float64, nothing skipped."""
-    memories: dict[Any, Memory] = field(default_factory=dict)
+    memories: dict[Any, EncodedFrames] = field(default_factory=dict)
     """What the network remembers of t - 1, by all that its features depend on."""
 
     def __post_init__(self) -> None:
@@ -106,11 +106,11 @@ def _task(
     return task
 
 
-def _memory(bench: Bench, setting: Setting, index: int, given: NetworkInput) -> Memory:
+def _memory(bench: Bench, setting: Setting, index: int, given: NetworkInput) -> EncodedFrames:
     """The model's memory when it has seen the frame at t - 1."""
     key = setting.skip, setting.autocast, setting.size, index
     if key not in bench.memories:
-        bench.model.memory = Memory()
+        bench.model.memory = EncodedFrames()
         with as_set(bench.model, setting), torch.no_grad():
             bench.model.encode(given.frame_prev)
         bench.memories[key] = bench.model.memory
@@ -172,7 +172,7 @@ def recursions(bench: Bench, horizons: Sequence[int], tell: Tell = lambda _: Non
         mode, steps = asked[name]
         images[name] = []
         for scene in bench.scenes:
-            bench.model.memory = Memory()
+            bench.model.memory = EncodedFrames()
             images[name].append(step(bench.model, scene.given, steps, mode).clamp(0, 1))
 
     seconds = _timing.interleave({name: partial(run, name) for name in asked}, 0.0, bench.runs)

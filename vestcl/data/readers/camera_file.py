@@ -40,7 +40,7 @@ _MOST: Final = {
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class LensCamera:
     """One camera of a camera.json."""
 
     K: Matrix
@@ -49,7 +49,7 @@ class Camera:
     """(height, width) that K is for."""
     distortion: Distortion | None = None
 
-    def fit(self, size: fit.Size, path: Path) -> "Camera":
+    def fit(self, size: fit.Size, path: Path) -> "LensCamera":
         """The camera of images of ``size``, see `fit.fit_intrinsics`.
 
         Raises:
@@ -64,12 +64,12 @@ class CameraFile:
     """What a camera.json says."""
 
     path: Path
-    camera: Camera
+    camera: LensCamera
     fps: float | None = None
     depth_scale: float | None = None
     label_ids: LabelKind | None = None
     baseline: float | None = None
-    right: Camera | None = None
+    right: LensCamera | None = None
     """None is as the left one."""
 
 
@@ -105,16 +105,16 @@ def _check_keys(path: Path, content: Mapping[str, Any], known: tuple[str, ...]) 
     raise ValueError(f"{path}: unknown keys {names[:200]}{guess}; it may have {', '.join(known)}")
 
 
-def _camera(path: Path, content: Mapping[str, Any], top: Mapping[str, Any]) -> Camera:
+def _camera(path: Path, content: Mapping[str, Any], top: Mapping[str, Any]) -> LensCamera:
     if missing := [key for key in _NUMBERS if not _is_number(content.get(key))]:
         raise ValueError(f"{path}: must have the numbers {', '.join(missing)}")
     K = calibration.intrinsics(*(_bounded(path, content, key) for key in _NUMBERS))
     calibration.check_intrinsics(K, str(path))
     K = calibration.from_integer_centres(K) if _choice(path, top, "pixel_centre") in (None, "integer") else K
-    return Camera(K, _size(path, content), _distortion(path, content))
+    return LensCamera(K, _size(path, content), _distortion(path, content))
 
 
-def _right(path: Path, content: Any, top: Mapping[str, Any], left: Camera) -> Camera:
+def _right(path: Path, content: Any, top: Mapping[str, Any], left: LensCamera) -> LensCamera:
     if not isinstance(content, dict) or set(_NUMBERS) - set(content) or set(content) - set(_CAMERA):
         others = ", ".join(_CAMERA[len(_NUMBERS) :])
         wanted = f"`right` must have {', '.join(_NUMBERS)} and nothing else but {others}"

@@ -24,12 +24,12 @@ from vestcl.data import calibration
 from vestcl.data.calibration import Matrix
 from vestcl.data.lens import Lens, OutsideLens, undistorted_depth, undistorted_image, undistorted_labels
 from vestcl.data.readers import files
-from vestcl.data.readers.camera_file import Camera, CameraFile, read_camera
+from vestcl.data.readers.camera_file import CameraFile, LensCamera, read_camera
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.data.sources import DepthFile, DepthSource, ImageFile, LabelFile, LabelSource
 from vestcl.io.images import image_size
 
-__all__ = ["FRAMES", "Camera", "CameraFile", "frames_of", "open_folder", "read_camera"]
+__all__ = ["FRAMES", "CameraFile", "LensCamera", "frames_of", "open_folder", "read_camera"]
 
 #: Folders that frames are looked for in, the first that is there; else they are next to camera.json.
 FRAMES: Final = ("image", "images", "left")
@@ -100,13 +100,13 @@ def _camera_file(folder: Path, size: tuple[int, int], fov: float | None) -> Came
     if fov is not None:
         if files.is_present(path):
             raise ValueError(f"{path}: tells the camera; leave out `fov`")
-        return CameraFile(path, Camera(calibration.intrinsics_from_fov(fov, *size), size))
+        return CameraFile(path, LensCamera(calibration.intrinsics_from_fov(fov, *size), size))
     if not files.is_present(path):
         raise ValueError(f"{path}: no such file; write one with fx, fy, cx, cy, or give `fov` in degrees")
     return read_camera(path)
 
 
-def _lens(camera: Camera, size: tuple[int, int], path: Path) -> Lens | None:
+def _lens(camera: LensCamera, size: tuple[int, int], path: Path) -> Lens | None:
     return None if camera.distortion is None else Lens.of(camera.K, size, camera.distortion, str(path))
 
 

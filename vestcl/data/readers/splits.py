@@ -50,7 +50,7 @@ FUTURE: Final = 5
 
 
 @dataclass(frozen=True)
-class Window:
+class SplitWindow:
     """Indices of consecutive frames in a clip."""
 
     context: range
@@ -59,7 +59,7 @@ class Window:
     """Frames t+1, t+2, ..."""
 
 
-def windows(frames: int, context: int = CONTEXT, future: int = FUTURE, stride: int = 1) -> Iterator[Window]:
+def windows(frames: int, context: int = CONTEXT, future: int = FUTURE, stride: int = 1) -> Iterator[SplitWindow]:
     """All windows of ``context`` + ``future`` frames that fit, in order.
 
     Args:
@@ -77,4 +77,4 @@ def windows(frames: int, context: int = CONTEXT, future: int = FUTURE, stride: i
     if stride < 1:
         raise ValueError(f"`stride` must be at least 1, got {stride}")
     starts = range(0, frames - context - future + 1, stride)
-    return (Window(range(at, at + context), range(at + context, at + context + future)) for at in starts)
+    return (SplitWindow(range(at, at + context), range(at + context, at + context + future)) for at in starts)

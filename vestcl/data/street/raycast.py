@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vestcl import constants, opencl
 
 #: z-depth of the sky in metres: far enough that a metre's move shifts it by less than a pixel, and finite.
-SKY_DEPTH: Final = 1000.0
+STREET_SKY_DEPTH: Final = 1000.0
 
 #: Side of a cell of the shadow grid in metres: about a car, so that few shadows touch one.
 SHADOW_CELL: Final = 4.0
@@ -224,7 +224,7 @@ def _launch(
 ) -> None:
     names = {f"{kind.__name__.upper()}_{m.name}": int(m) for kind in (Shape, Material, Label) for m in kind}
     defines = opencl.defines_for(
-        np.dtype(np.float32), SKY_DEPTH=f"{SKY_DEPTH}f", SHADOW_CELL=f"{SHADOW_CELL}f", **names
+        np.dtype(np.float32), SKY_DEPTH=f"{STREET_SKY_DEPTH}f", SHADOW_CELL=f"{SHADOW_CELL}f", **names
     )
     if bent:
         defines |= {

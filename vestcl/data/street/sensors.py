@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vestcl.data.street.camera import intrinsics
 from vestcl.data.street.clip import Shot
-from vestcl.data.street.raycast import FOREGROUND, SKY_DEPTH
+from vestcl.data.street.raycast import FOREGROUND, STREET_SKY_DEPTH
 
 #: A scanner's elevations, degrees, its range in metres and the standard deviation of that: Velodyne's HDL-64E, as on
 #: KITTI's car (data sheet 63-9194; 64 beams). BEAMS are drawn from: its number, half and a quarter of it.
@@ -51,7 +51,7 @@ class StreetScan:
         rng = np.random.default_rng([self.shot.street.seed, _SCAN, self.index])
         noise, kept = rng.normal(0, RANGE_STD, rows.shape), rng.random(rows.shape) > LOST
         z = depth[rows, columns]
-        kept &= (z < SKY_DEPTH) & (z * lengths < FARTHEST)
+        kept &= (z < STREET_SKY_DEPTH) & (z * lengths < FARTHEST)
         result = np.full(depth.shape, np.inf, np.float32)
         np.minimum.at(result, (rows[kept], columns[kept]), (z + noise / lengths)[kept].astype(np.float32))
         return np.where(np.isfinite(result), np.maximum(result, 0), np.float32(0))[None]

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
-from vestcl.forecasting.geometric.memory import MEMORY, Memory, remember
+from vestcl.forecasting.geometric.memory import MEMORY, SceneMemory, remember
 from vestcl.forecasting.geometric.paths import Paths, forecast_cameras, point_paths
-from vestcl.forecasting.geometric.render import Cloud, Shown, holes, rendered, show
+from vestcl.forecasting.geometric.render import FrameCloud, Shown, holes, rendered, show
 from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.scene.exposure import as_exposed
 from vestcl.scene.inpainting.holes import deep_holes, fill_holes
@@ -162,11 +162,11 @@ def show_frame(
     return {view.name: _render(clouds, clip[index].K if view.K is None else view.K, view, clip) for view in views}
 
 
-MovingCloud = Callable[[int, list[NDArray[np.float64]]], Cloud]
+MovingCloud = Callable[[int, list[NDArray[np.float64]]], FrameCloud]
 """A cloud at a step, given ``future_from_cur`` of all steps from 0."""
 
 
-def _clouds(perception: Perception, index: int, paths: Paths, memory: Memory | None = None) -> list[MovingCloud]:
+def _clouds(perception: Perception, index: int, paths: Paths, memory: SceneMemory | None = None) -> list[MovingCloud]:
     """What the current frame shows; what the one before did; what is remembered; what is behind the foreground."""
     K = perception.clip[index].K
     cur, prev = perception.seen(index), perception.surface(index - 1)
@@ -219,7 +219,7 @@ def _cloud(
     return _moving(lambda k, camera: _transform(camera, points + k * speed), z_src, image, y, x)
 
 
-def _static(memory: Memory) -> MovingCloud:
+def _static(memory: SceneMemory) -> MovingCloud:
     """What is remembered, at rest in the world."""
     pixels = memory.rows, memory.columns
     return _moving(lambda k, camera: _transform(camera, memory.points_xyz), memory.z_src, memory.image, *pixels)
@@ -242,9 +242,9 @@ def _moving(
             kept[step] = moved(step, future_from_cur)
         return kept[step]
 
-    def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> Cloud:
+    def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> FrameCloud:
         there, before = (points_at(k, future_from_cur[k]) for k in (step, step - 1))
-        return Cloud(there.astype(np.float32), z_src, image, (there - before).astype(np.float32), rows, columns)
+        return FrameCloud(there.astype(np.float32), z_src, image, (there - before).astype(np.float32), rows, columns)
 
     return at
 
@@ -256,7 +256,7 @@ def _transform(dst_from_src: NDArray[np.float64], points: NDArray[np.float64]) -
     return np.asarray(cv2.transform(points[:, None], dst_from_src[:3]), np.float64)[:, 0]
 
 
-def _render(clouds: list[Cloud], K: NDArray[np.float64], view: View, clip: Clip) -> Rendered:
+def _render(clouds: list[FrameCloud], K: NDArray[np.float64], view: View, clip: Clip) -> Rendered:
     """What was seen, in its holes what is remembered, then what is behind the foreground, then what surrounds them.
 
     The inpainted background is a guess, and only wanted where the foreground has moved away: cracks, and what enters

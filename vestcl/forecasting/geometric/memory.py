@@ -54,7 +54,7 @@ Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
+class SceneMemory:
     """Points of the static scene in the camera at t; N is no more than an image has pixels."""
 
     points_xyz: Matrix
@@ -85,7 +85,7 @@ class _Kept:
     """[4, 4] m, the camera's motion to the next frame."""
 
 
-def remember(perception: Perception, index: int, frames: int) -> Memory | None:
+def remember(perception: Perception, index: int, frames: int) -> SceneMemory | None:
     """What frames t-2, t-3, ... saw of the static scene that t and t-1 don't cover.
 
     Frames that disagree with t are left out, and those before a gap in time that is too long to be matched.
@@ -113,7 +113,7 @@ def remember(perception: Perception, index: int, frames: int) -> Memory | None:
         return None
     cur, prev = perception.surface(index), perception.surface(index - 1)
     prev_from_cur, K = perception.prev_from_cur(index), perception.clip[index].K
-    cur_from_src, parts, count = np.asarray(np.linalg.inv(prev_from_cur), np.float64), list[Memory](), 0
+    cur_from_src, parts, count = np.asarray(np.linalg.inv(prev_from_cur), np.float64), list[SceneMemory](), 0
     for frame in reversed(kept):
         cur_from_src = cur_from_src @ frame.next_from_cur
         aligned = _aligned(frame, cur_from_src, cur, K)
@@ -126,7 +126,7 @@ def remember(perception: Perception, index: int, frames: int) -> Memory | None:
         count += int(shown.sum())
         if count > shown.size:
             break
-        parts.append(Memory(_points(depth, shown, cur_from_src, K).T, depth[shown], image, *np.nonzero(shown[0])))
+        parts.append(SceneMemory(_points(depth, shown, cur_from_src, K).T, depth[shown], image, *np.nonzero(shown[0])))
     return _stacked(parts) if parts else None
 
 
@@ -225,10 +225,10 @@ def _aligned(frame: _Kept, cur_from_src: Matrix, cur: Surface, K: Matrix) -> tup
     return curve(frame.image), np.where(solid, np.float32(scale) * frame.depth, frame.depth)
 
 
-def _stacked(parts: list[Memory]) -> Memory:
+def _stacked(parts: list[SceneMemory]) -> SceneMemory:
     """One memory of all; a row between images parts their surfaces."""
     height = parts[0].image.shape[1] + 1
-    return Memory(
+    return SceneMemory(
         np.concatenate([part.points_xyz for part in parts]),
         np.concatenate([part.z_src for part in parts]),
         np.concatenate([np.pad(part.image, ((0, 0), (0, 1), (0, 0)), "edge") for part in parts], axis=1),

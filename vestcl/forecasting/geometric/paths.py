@@ -28,7 +28,7 @@ _TESTED: Final = (1, 2)
 class Paths:
     """The points of all pixels of a frame, over time."""
 
-    frame: backtest.Frame
+    frame: backtest.BacktestFrame
     errors: tuple[NDArray[np.float32], ...] = ()
     """[C, H, W]: how wrong the candidates would have been, for the first step and for all later ones
     (`backtest.by_step`). Without any, points have their objects' velocities."""

@@ -57,7 +57,7 @@ _SQUARED: Final = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class FrameCloud:
     """Points of one frame, at the time that is shown."""
 
     points_xyz: NDArray[np.float32]
@@ -85,7 +85,7 @@ class Shown:
 
 
 def show(
-    clouds: list[Cloud],
+    clouds: list[FrameCloud],
     K: NDArray[np.float64],
     tgt_from_next: NDArray[np.float64],
     height: int,
@@ -146,7 +146,7 @@ class _Wanted:
 
 
 def _splat(
-    cloud: Cloud, K: NDArray[np.float64], tgt_from_next: NDArray[np.float64], wanted: _Wanted
+    cloud: FrameCloud, K: NDArray[np.float64], tgt_from_next: NDArray[np.float64], wanted: _Wanted
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """image [7, L], divided by coverage, and coverage [M]."""
     still = np.zeros((1, *cloud.points_xyz.shape), np.float32)
@@ -170,7 +170,7 @@ def _splat(
 
 
 def _features(
-    cloud: Cloud, uv: NDArray[np.float32], z: NDArray[np.float32], whole: NDArray[np.bool_]
+    cloud: FrameCloud, uv: NDArray[np.float32], z: NDArray[np.float32], whole: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """[N, 16]: colour 3, inverse depth, motion 3, and what `_origins` finds of points at ``uv`` [2, N], ``z`` [N]."""
     pixels, distance = _Pixels.of(cloud), np.maximum(z, np.float32(1e-3), dtype=np.float32)
@@ -182,7 +182,9 @@ def _features(
     return _transposed(features)
 
 
-def _near(cloud: Cloud, points_uv: NDArray[np.float32], pixels: NDArray[np.intp], view: _Wanted) -> NDArray[np.bool_]:
+def _near(
+    cloud: FrameCloud, points_uv: NDArray[np.float32], pixels: NDArray[np.intp], view: _Wanted
+) -> NDArray[np.bool_]:
     """[N], True where a point may be seen in one of the ``pixels`` [M] of a view, flat, or where such a point needs it.
 
     What a point is, its neighbours say, and theirs: points up to two pixels away in the image that they come from.
@@ -199,10 +201,10 @@ def _near(cloud: Cloud, points_uv: NDArray[np.float32], pixels: NDArray[np.intp]
     return np.asarray(cv2.dilate(needed, np.ones((5, 5), np.uint8)))[cloud.rows, cloud.columns] > 0
 
 
-def _some(cloud: Cloud, kept: NDArray[np.bool_]) -> Cloud:
+def _some(cloud: FrameCloud, kept: NDArray[np.bool_]) -> FrameCloud:
     """The points of ``kept`` [N]."""
     moving = cloud.points_xyz[kept], cloud.z_src[kept], cloud.image, cloud.step_xyz[kept]
-    return Cloud(*moving, cloud.rows[kept], cloud.columns[kept])
+    return FrameCloud(*moving, cloud.rows[kept], cloud.columns[kept])
 
 
 def _transposed(matrix: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -230,7 +232,7 @@ class _Pixels:
     """... or each one, in order."""
 
     @classmethod
-    def of(cls, cloud: Cloud) -> "_Pixels":
+    def of(cls, cloud: FrameCloud) -> "_Pixels":
         height, width = cloud.image.shape[1:]
         flat = cloud.rows * width + cloud.columns
         count = height * width
@@ -268,7 +270,7 @@ class _Pixels:
 
 
 def _origins(
-    cloud: Cloud,
+    cloud: FrameCloud,
     pixels: _Pixels,
     uv: NDArray[np.float32],
     zoom: NDArray[np.float32],

@@ -15,7 +15,7 @@ from vestcl.forecasting.geometric.paths import point_paths
 from vestcl.forecasting.network.backtest import choose_parts
 from vestcl.forecasting.network.input import NetworkInput
 from vestcl.forecasting.network.learned import REFINEMENT, CorrectedPaths, Learned, chosen_motion, given_input, refined
-from vestcl.forecasting.result import Forecast, Rendered, Skipped, View
+from vestcl.forecasting.result import Forecast, Rendered, SkippedWork, View
 from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
 from vestcl.models.inference.skipping import Count, Tally, count_skips
@@ -196,7 +196,7 @@ class _Clock:
         return time.perf_counter() - sum(self._perception.seconds.values())
 
 
-def what_was_skipped(tally: Tally, profile: Mapping[str, float]) -> dict[str, Skipped]:
+def what_was_skipped(tally: Tally, profile: Mapping[str, float]) -> dict[str, SkippedWork]:
     """Counters with what they saved: t n_skipped / n_computed, t of the stage that would have done it.
 
     Encoding a frame and its background counts as encoding as many pixels; a view is splatted and refined. What a point
@@ -216,7 +216,7 @@ def what_was_skipped(tally: Tally, profile: Mapping[str, float]) -> dict[str, Sk
     for switch, count in tally.counts.items():
         computed = count.of - count.skipped + (pixels.of if switch == "background" else 0)
         saved = timed[switch] * count.skipped / computed if switch in timed and computed else None
-        skipped[switch] = Skipped(*count, saved)
+        skipped[switch] = SkippedWork(*count, saved)
     return skipped
 
 

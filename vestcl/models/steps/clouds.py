@@ -16,7 +16,7 @@ from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.unproject import unproject
 
 
-class Grid(NamedTuple):
+class PixelGrid(NamedTuple):
     """The points start ... start + height width - 1 are a picture's pixels, row after row."""
 
     start: int
@@ -43,7 +43,7 @@ class Cloud(NamedTuple):
     """[P, 1]: 1 on the static background."""
     inpainted: torch.Tensor
     """bool [P]: what no frame has seen."""
-    grids: tuple[Grid, ...]
+    grids: tuple[PixelGrid, ...]
     """Which points are all the pixels of a frame. Others, as inpainted ones, have no neighbours."""
     starts: torch.Tensor
     """int64 [B + 1]."""
@@ -98,7 +98,7 @@ def lift(
         points(layers.image),
         layers.mask.reshape(-1, 1),
         torch.zeros(batch * height * width, dtype=torch.bool),
-        tuple(Grid(start, height, width) for start in starts[:-1].tolist()),
+        tuple(PixelGrid(start, height, width) for start in starts[:-1].tolist()),
         starts,
     )
 

@@ -20,7 +20,7 @@ _SOME: Final = 16
 
 
 class State:
-    """What features depend on besides the frame; `Memory.state` gives one object for equal weights and settings.
+    """What features depend on besides the frame; `EncodedFrames.state` gives one object for equal weights and settings.
 
     Args:
         settings: compared by ``==``.
@@ -46,7 +46,7 @@ class _Remembered(NamedTuple):
     thread: int
 
 
-class Memory:
+class EncodedFrames:
     """The last frames that were encoded, for when they come again.
 
     Content decides: a frame is known if every number of its layers and of the weights is as it was, wherever they lie
@@ -60,12 +60,12 @@ class Memory:
         self._frames: tuple[_Remembered, ...] = ()
         self._latest: State | None = None
 
-    def __reduce__(self) -> tuple[type["Memory"], tuple[()]]:
-        return Memory, ()
+    def __reduce__(self) -> tuple[type["EncodedFrames"], tuple[()]]:
+        return EncodedFrames, ()
 
-    def copy(self) -> "Memory":
+    def copy(self) -> "EncodedFrames":
         """Another memory of the same frames."""
-        other = Memory()
+        other = EncodedFrames()
         with self._lock:
             other._frames, other._latest = self._frames, self._latest
         return other

@@ -12,7 +12,7 @@ from vestcl.constants import SKY_DEPTH
 from vestcl.models.config import LEAST_COVERAGE, RenderConfig
 from vestcl.models.inference.skipping import Tally
 from vestcl.models.networks.layers import side_by_side
-from vestcl.models.steps.clouds import Cloud, Grid, last_motion
+from vestcl.models.steps.clouds import Cloud, PixelGrid, last_motion
 from vestcl.ops.displace import displace
 from vestcl.ops.splat import composite, rasterize
 from vestcl.ops.stretch import stretch
@@ -222,7 +222,7 @@ def _pixels_of(points_uv: torch.Tensor, starts: torch.Tensor, height: int, width
 
 
 def _surface(
-    points_uv: torch.Tensor, magnified: torch.Tensor, grids: Sequence[Grid]
+    points_uv: torch.Tensor, magnified: torch.Tensor, grids: Sequence[PixelGrid]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """`stretch` of each of ``grids`` among the points [P, 2] and [P]; 1 and 1 for others, which have no neighbours."""
     factor, opacity = torch.ones_like(magnified), torch.ones_like(magnified)

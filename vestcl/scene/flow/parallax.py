@@ -32,7 +32,7 @@ _ISLAND, _ISLAND_STEP = 200, 0.003
 _INVERSE_STEP: Final = 2e-4
 
 
-class View(NamedTuple):
+class OtherFrame(NamedTuple):
     """Another frame of the same scene."""
 
     correspondence: Correspondence
@@ -45,7 +45,7 @@ def refine_depth(
     depth: ArrayLike,
     inverse_std: float,
     K: ArrayLike,
-    views: Sequence[View],
+    views: Sequence[OtherFrame],
     static: ArrayLike,
 ) -> NDArray[np.float32]:
     """Weighted least squares over s = 1/z: (s - 1/z)^2 / std^2 + sum over views of |p'(s) - p - flow|^2 / flow_std^2.
@@ -95,7 +95,7 @@ def refine_depth(
 
 
 def _measure(
-    given: NDArray[np.float32], known: NDArray[np.bool_], K: NDArray[np.float64], view: View
+    given: NDArray[np.float32], known: NDArray[np.bool_], K: NDArray[np.float64], view: OtherFrame
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Inverse depth [1, H, W] by the flow alone, |dp'/ds|^2 (px m)^2, and whether the flow keeps to its line."""
     flow, error = view.correspondence

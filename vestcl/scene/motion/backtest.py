@@ -50,7 +50,7 @@ _UNEXPLAINED: Final = 1e-3
 _NEAREST: Final = 0.1
 
 
-class Frame(NamedTuple):
+class BacktestFrame(NamedTuple):
     """A frame and how its pixels came from the one before."""
 
     image: Array
@@ -69,7 +69,7 @@ class Frame(NamedTuple):
     """Intervals since the frame before."""
 
 
-def residual_flow(frame: Frame) -> Array:
+def residual_flow(frame: BacktestFrame) -> Array:
     """r [2, H, W] px an interval, forward: what flow shows beyond the camera's motion, (p' - (p + flow)) / elapsed.
 
     p' is where the point would have been in the frame before at rest. 0 where the difference is no motion but a wrong
@@ -82,7 +82,7 @@ def residual_flow(frame: Frame) -> Array:
 
 
 def candidates(
-    frame: Frame, residual: Array, future_from_cur: NDArray[np.float64], ahead: float, by_flow: bool = False
+    frame: BacktestFrame, residual: Array, future_from_cur: NDArray[np.float64], ahead: float, by_flow: bool = False
 ) -> tuple[Array, Array]:
     """Where each pixel's point may be after ``ahead`` intervals.
 
@@ -110,7 +110,7 @@ def candidates(
     return np.stack(found).astype(np.float32), np.maximum(z, _NEAREST).astype(np.float32)
 
 
-def backtest(positions: Array, before: Frame, after: Array, flows: Sequence[Array]) -> Array:
+def backtest(positions: Array, before: BacktestFrame, after: Array, flows: Sequence[Array]) -> Array:
     """Errors e_c at t of candidates that knew nothing of t.
 
     Args:
@@ -138,7 +138,7 @@ def backtest(positions: Array, before: Frame, after: Array, flows: Sequence[Arra
     return np.stack(errors)
 
 
-def untested(frame: Frame, by_flow: bool = False) -> Array:
+def untested(frame: BacktestFrame, by_flow: bool = False) -> Array:
     """Errors [C, H, W] where nothing could be tested, as there are two frames only: velocity and residual flow mix.
 
     Args:
@@ -216,7 +216,7 @@ def coherent(positions: Array, errors: Array, image: Array, moving: NDArray[np.b
     return np.asarray(positions + unexplained * (around - way), np.float32)
 
 
-def _brought(frame: Frame, dst_from_src: NDArray[np.float64]) -> NDArray[np.float64]:
+def _brought(frame: BacktestFrame, dst_from_src: NDArray[np.float64]) -> NDArray[np.float64]:
     """K (R x + t) [3, H, W] of the points x that the pixels show: z m and, over it, px in another camera."""
     start, shift = epipolar(frame.K, dst_from_src, *frame.depth.shape[1:])
     start *= frame.depth

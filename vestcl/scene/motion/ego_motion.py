@@ -28,7 +28,7 @@ _FEWEST: Final = 24
 _INLIERS: Final = 0.15
 
 
-class EgoMotion(NamedTuple):
+class CameraMotion(NamedTuple):
     """A camera's motion between two frames."""
 
     dst_from_src: NDArray[np.float64]
@@ -39,7 +39,7 @@ class EgoMotion(NamedTuple):
 
 def ego_motion(
     depth: ArrayLike, mask: ArrayLike, correspondence: Correspondence, K: ArrayLike, *, far: float = _FAR
-) -> EgoMotion:
+) -> CameraMotion:
     """dst_from_src that brings what the pixels of src show to where flow finds it in dst.
 
     min over (R, t) of sum |project(K (R x_i + t)) - (p_i + flow(p_i))|^2 over the inliers that RANSAC found, with
@@ -67,7 +67,7 @@ def ego_motion(
     check_size("correspondence", correspondence, depth)
     points_xyz, points_uv = _pairs(depth, mask, correspondence, K, far)
     if len(points_xyz) < _FEWEST:
-        return EgoMotion(np.eye(4), 0.0)
+        return CameraMotion(np.eye(4), 0.0)
     cv2.setRNGSeed(0)  # RANSAC draws from OpenCV's own generator: the same frames give the same motion
     found, turn, shift, inliers = cv2.solvePnPRansac(
         points_xyz,
@@ -79,11 +79,11 @@ def ego_motion(
         confidence=_CONFIDENCE,
     )
     if not found or inliers is None or len(inliers) < max(_FEWEST, _INLIERS * len(points_xyz)):
-        return EgoMotion(np.eye(4), 0.0)
+        return CameraMotion(np.eye(4), 0.0)
     agree = inliers[:, 0]
     refined = cv2.solvePnPRefineLM(points_xyz[agree], points_uv[agree], K, None, turn, shift)
     turn, shift = (np.asarray(vector, np.float64)[:, 0] for vector in refined)
-    return EgoMotion(rigid(turn, shift), len(agree) / len(points_xyz))
+    return CameraMotion(rigid(turn, shift), len(agree) / len(points_xyz))
 
 
 def _pairs(
