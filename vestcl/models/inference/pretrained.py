@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # names and files are known without torch, which takes second
 SHIPPED: Final = ("vest-s",)
 
 #: In a wheel, an editable install and a bare checkout alike.
-FOLDER: Final = Path(__file__).resolve().parent / "weights"
+FOLDER: Final = Path(__file__).resolve().parents[2] / "weights"
 
 #: What of a training checkpoint's folder is taken, the first that is there: the running mean forecasts better.
 _OF_A_CHECKPOINT: Final = ("ema.safetensors", "model.safetensors")
