@@ -103,7 +103,8 @@ def test_bench(monkeypatch: pytest.MonkeyPatch) -> None:
     assert cli.main(["bench", "splat"]) == 0
     assert cli.main(["bench", "splat", "--points", "5"]) == 0
     assert configs == [SplatBench(1000), SplatBench(5)]
-    monkeypatch.delitem(sys.modules, "vestcl.bench.forecast.inpaint", raising=False)
+    for name in ("vestcl.bench.forecast", "vestcl.bench.forecast.inpaint"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
     for mistake in ([], ["abacus"], ["inpaint"]):  # this stand-in has no bench of that name
         with pytest.raises(SystemExit):
             cli.main(["bench", *mistake])

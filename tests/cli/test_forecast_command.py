@@ -14,6 +14,7 @@ from st_lpips_weights import public_state
 from stand_ins import put_module
 
 from vestcl import opencl
+from vestcl.cli import clip as clip_command
 from vestcl.cli import main as cli
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
@@ -201,7 +202,7 @@ def test_street(
         image = np.zeros((3, HEIGHT, WIDTH))
         return Clip("street", "street", tuple(Sample.from_arrays(f"{i}", image, K) for i in range(frames)))
 
-    monkeypatch.setattr(Street, "clip", clip, raising=False)
+    monkeypatch.setattr(clip_command, "street_clip", clip)
     assert cli.main(["forecast", "street:7", "--out", str(tmp_path / "out"), *told.split()]) == 0
     assert wanted == [(7, frames, size)]
     assert repeater.calls[0][1] == index

@@ -21,11 +21,11 @@ ROOT = Path(__file__).resolve().parents[2]
 SAVES_FOREVER = """
 import itertools, sys, torch
 from forecaster_scenes import TINY
-from train.run.checkpoint import State, save
+from train.run.checkpoint import TrainingState, save
 for step in itertools.count(int(sys.argv[2])):
     weights = {"w": torch.full((1_000_000,), float(step))}
     print("begin", step, flush=True)
-    save(sys.argv[1], State(step, {}, TINY, weights, weights, {"m": [weights["w"] + 1] * 3}, {}), keep=2)
+    save(sys.argv[1], TrainingState(step, {}, TINY, weights, weights, {"m": [weights["w"] + 1] * 3}, {}), keep=2)
     print("done", step, flush=True)
 """
 
@@ -33,10 +33,10 @@ for step in itertools.count(int(sys.argv[2])):
 SAVES_TOO_MUCH = """
 import resource, sys, torch
 from forecaster_scenes import TINY
-from train.run.checkpoint import CheckpointError, State, save
+from train.run.checkpoint import CheckpointError, TrainingState, save
 resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
 def state(step, weights, moments):
-    return State(step, {}, TINY, {"w": torch.zeros(weights)}, None, {"m": torch.zeros(moments)}, {})
+    return TrainingState(step, {}, TINY, {"w": torch.zeros(weights)}, None, {"m": torch.zeros(moments)}, {})
 save(sys.argv[1], state(1, 1000, 1000))
 try:
     save(sys.argv[1], state(2, *map(int, sys.argv[2:])))
@@ -50,12 +50,12 @@ except CheckpointError as error:
 DIES_EVERYWHERE = """
 import os, pathlib, shutil, signal, sys, torch
 from forecaster_scenes import TINY
-from train.run.checkpoint import State, _verified, list_checkpoints, load_latest, save
+from train.run.checkpoint import TrainingState, _verified, list_checkpoints, load_latest, save
 torch.set_num_threads(1)
 
 def state(step):
     weights = {"w": torch.full((100,), float(step))}
-    return State(step, {}, TINY, weights, weights, {"m": weights["w"] + 1}, {})
+    return TrainingState(step, {}, TINY, weights, weights, {"m": weights["w"] + 1}, {})
 
 def deadly(function, calls):
     def call(*arguments, **options):

@@ -36,7 +36,7 @@ def clips(cache: Path) -> list[PreparedClip]:
     return find_prepared(cache)
 
 
-def window_of(clips: list[PreparedClip], horizon: int = 1) -> degrade.Window:
+def window_of(clips: list[PreparedClip], horizon: int = 1) -> degrade.TrainingWindow:
     windows = WindowSet(clips, horizons=(0, 1) if horizon == 2 else (1,))
     return windows.window(next(d for d in windows.global_batch(0, 0, 9) if d.frame == 2))
 
