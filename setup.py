@@ -22,6 +22,7 @@ setup(
         "numpy>=1.26",
         "opencv-contrib-python-headless>=4.10.0.82",
         "OpenEXR>=3.3",
+        "pandas>=2.2.2",  # the first for numpy 2
         "pillow>=10.1",  # load_default(size)
         "pyopencl[pocl]>=2024.2.7",  # older ones warn with current pytools
         "rich>=13",

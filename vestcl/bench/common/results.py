@@ -7,20 +7,23 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from rich.console import Console
 from rich.text import Text
 
 from vestcl import __version__, doctor, opencl
-from vestcl.bench.common.timing import Spread
-from vestcl.evaluation.tables import Grid, finite, to_markdown, to_rich
+from vestcl.bench.common.options import Options
+from vestcl.bench.common.table import Better, Section, show_grid
+from vestcl.bench.common.timing import Spread, torch_threads
+from vestcl.evaluation.tables import Grid, finite, to_markdown
 from vestcl.io import atomic
+from vestcl.opencl import trace
 
 #: The selector that means every device that works.
 ALL: Final = "all"
@@ -38,9 +41,28 @@ _FORMAT: Final = 1
 _PACKAGES: Final = ("torch", "numpy", "pyopencl", "pocl-binary-distribution")
 
 
+def check_positive(config: Any, *names: str) -> None:
+    """Refuse settings that are not above 0.
+
+    Raises:
+        ValueError: the message names the first.
+    """
+    for name in names:
+        if getattr(config, name) <= 0:
+            raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
+
+
+def settings(config: Any) -> dict[str, Any]:
+    """The fields of a benchmark's dataclass as JSON has them; files and folders as text."""
+    return dict(plain(dataclasses.asdict(config)))
+
+
+# ---------------------------------------------------------------- results
+
+
 @dataclass(frozen=True)
 class Measure:
-    """One figure of a benchmark: median and quartiles over its runs."""
+    """One figure that JSON keeps and `vestcl bench compare` compares: median and quartiles over its runs."""
 
     name: str
     """Unique in its `Results`, and the same from run to run."""
@@ -51,10 +73,10 @@ class Measure:
     """First quartile."""
     high: float
     """Third quartile."""
-    better: Literal["lower", "higher"] = "lower"
+    better: Better = "lower"
 
     @classmethod
-    def of(cls, name: str, unit: str, spread: Spread, better: Literal["lower", "higher"] = "lower") -> "Measure":
+    def of(cls, name: str, unit: str, spread: Spread, better: Better = "lower") -> "Measure":
         """The measure of several runs."""
         return cls(name, unit, spread.median, spread.low, spread.high, better)
 
@@ -66,7 +88,7 @@ class Results:
     bench: str
     """As in `vestcl bench NAME`."""
     machine: dict[str, str]
-    """What `describe` tells."""
+    """What `describe` returns."""
     config: dict[str, Any]
     """What `settings` makes of the benchmark's configuration."""
     measures: list[Measure]
@@ -74,6 +96,49 @@ class Results:
     """For the screen and Markdown; they are not in JSON."""
     details: dict[str, Any]
     """Whatever else is worth keeping; see `plain` for what it may hold."""
+
+
+def run(bench: str, config: Options, measure: Callable[[opencl.Session, Console], Iterator[Section]]) -> list[Results]:
+    """Measure on every device that is asked for, print section after section, and write the files.
+
+    Args:
+        bench: as in `vestcl bench NAME`.
+        config: of the benchmark.
+        measure: of one device, which is vestcl's current one.
+
+    Returns:
+        Results by device.
+
+    Raises:
+        DeviceError: as `measure_each`.
+    """
+    screen = console()
+
+    def measured(session: opencl.Session) -> Results:
+        machine = describe(session)
+        show_machine(machine, screen)
+        return collect(bench, machine, settings(config), measure(session, screen), screen)
+
+    with trace.record(config.trace), torch_threads(config.threads):
+        results = measure_each(config.device, measured, screen)
+    save(results, config.json, config.markdown)
+    tell_written(screen, config.json, config.markdown, config.trace, config.plots)
+    return results
+
+
+def collect(
+    bench: str, machine: dict[str, str], config: dict[str, Any], sections: Iterable[Section], screen: Console
+) -> Results:
+    """The sections as `Results`, each printed as it comes: figures that have a name, tables, and details joined."""
+    measures, grids, details = list[Measure](), list[Grid](), dict[str, Any]()
+    for section in sections:
+        measures += [Measure.of(one.name, one.unit, one.spread, one.better) for one in section.rows if one.name]
+        if section.title:
+            grids.append(section.grid())
+            show_grid(grids[-1], screen)
+        for key, value in section.details.items():
+            details[key] = details[key] + value if isinstance(value, list) and key in details else value
+    return Results(bench, machine, config, measures, grids, dict(plain(details)))
 
 
 # ---------------------------------------------------------------- devices
@@ -201,7 +266,7 @@ def show(results: Sequence[Results], console: Console) -> None:
     for result in results:
         show_machine(result.machine, console)
         for grid in result.grids:
-            console.print(to_rich(grid))
+            show_grid(grid, console)
 
 
 def show_machine(machine: dict[str, str], console: Console) -> None:
@@ -226,7 +291,7 @@ def save(results: Sequence[Results], json: Path | None, markdown: Path | None) -
     if len(benches) != 1:
         raise ValueError(f"`results` must be of one bench, got {', '.join(sorted(benches)) or 'none'}")
     if json is not None:
-        atomic.write_bytes(json, _to_json(results).encode())
+        write_json(json, _to_json(results))
     if markdown is not None:
         atomic.write_bytes(markdown, "\n".join(map(_to_markdown, results)).encode())
 
@@ -256,22 +321,6 @@ def load(path: Path) -> list[Results]:
         raise ValueError(f"{path}: a benchmark's file lacks or mistakes {error}") from error
 
 
-def check_positive(config: Any, *names: str) -> None:
-    """Refuse settings that are not above 0.
-
-    Raises:
-        ValueError: the message names the first.
-    """
-    for name in names:
-        if getattr(config, name) <= 0:
-            raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
-
-
-def settings(config: Any) -> dict[str, Any]:
-    """The fields of a benchmark's dataclass as JSON has them; files and folders as text."""
-    return dict(plain(dataclasses.asdict(config)))
-
-
 def plain(value: Any) -> Any:
     """``value`` as JSON has it: dataclasses become objects, tuples and arrays lists, paths text, NaN and infinity null.
 
@@ -293,9 +342,9 @@ def plain(value: Any) -> Any:
     return finite(value)
 
 
-def _to_json(results: Sequence[Results]) -> str:
+def _to_json(results: Sequence[Results]) -> dict[str, Any]:
     devices = [{name: getattr(r, name) for name in ("machine", "config", "measures", "details")} for r in results]
-    return json.dumps(plain({"vestcl": _FORMAT, "bench": results[0].bench, "devices": devices}), indent=1) + "\n"
+    return dict(plain({"vestcl": _FORMAT, "bench": results[0].bench, "devices": devices}))
 
 
 def _to_markdown(result: Results) -> str:

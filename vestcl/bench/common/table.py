@@ -1,0 +1,169 @@
+"""The long table of a benchmark, a row per measurement, and all that is pivoted from it: tables, figures, plots.
+
+    rows = [
+        Measurement("forward", "ms", spread, "s", name="splat forward"),   # a figure, in JSON as "splat forward"
+        Measurement("forward", "target", "<= 4 reached"),                  # a text
+    ]
+    frame = long_table(rows)             # a pandas DataFrame
+    grid = pivot(frame, title, notes)    # rows by columns, as text
+    show_grid(grid, console)             # a table, or several below each other where it is too wide
+
+A bench yields `Section`s: title, rows, notes and details. `vestcl.bench.common.results.run` prints and saves them.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
+
+import pandas as pd  # type: ignore[import-untyped]
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from vestcl.bench.common.timing import Spread, is_quiet
+from vestcl.evaluation.tables import Grid
+
+Better = Literal["lower", "higher"]
+
+#: Unit -> factor to what tables show: milliseconds, megabytes.
+SHOWN: Final = {"s": 1e3, "B": 1e-6}
+
+#: What a cell may end with, and its colour on the screen.
+_VERDICTS: Final = {"reached": "green", "missed": "red", "can't tell": "yellow", "better": "green", "worse": "red"}
+
+_AGAIN: Final = "measure again"
+
+#: Columns of the screen around a cell.
+_AROUND: Final = 3
+
+#: As wide as a first column gets before its text is wrapped.
+_LABEL: Final = 38
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One row of the long table, and one cell of a printed table."""
+
+    row: str
+    column: str
+    """Of the printed table; "" leaves it out of there."""
+    value: Spread | float | str
+    """A text is shown as it is, and is no figure."""
+    unit: str = "1"
+    """ "s", "B", "dB", "1" (a ratio, a relative error), ..."""
+    digits: str = ""
+    """Format of the median; without it three digits or so, and the quartiles."""
+    name: str = ""
+    """In JSON, unique in a benchmark's results; "" keeps the figure out of it."""
+    better: Better = "lower"
+
+    @property
+    def spread(self) -> Spread:
+        """Median and quartiles; NaN for a text."""
+        if isinstance(self.value, Spread):
+            return self.value
+        value = float("nan") if isinstance(self.value, str) else float(self.value)
+        return Spread(value, value, value, 1)
+
+    @property
+    def text(self) -> str:
+        """For a cell; "-" where there is no number."""
+        if isinstance(self.value, str):
+            return self.value
+        spread, factor = self.spread, SHOWN.get(self.unit, 1.0)
+        if spread.median != spread.median:
+            return "-"
+        return f"{spread.median * factor:{self.digits}}" if self.digits else quartiles(spread, factor)
+
+
+def quartiles(spread: Spread, factor: float = 1.0) -> str:
+    """ "12.3 (12.1-12.6)"."""
+    median, low, high = (value * factor for value in (spread.median, spread.low, spread.high))
+    digits = 0 if median >= 100 else 1 if median >= 10 else 2
+    return f"{median:.{digits}f} ({low:.{digits}f}-{high:.{digits}f})"
+
+
+@dataclass(frozen=True)
+class Section:
+    """What one part of a bench found."""
+
+    title: str
+    """Of its table; "" prints none."""
+    rows: list[Measurement]
+    notes: tuple[str, ...] = ()
+    details: dict[str, Any] = field(default_factory=dict)
+    """For JSON, see `vestcl.bench.common.results.plain`; lists of several sections under one key become one list."""
+
+    def grid(self) -> Grid:
+        """Rows by columns."""
+        return pivot(long_table(row for row in self.rows if row.column), self.title, self.notes)
+
+
+def long_table(rows: Iterable[Measurement]) -> pd.DataFrame:
+    """The rows as a DataFrame: row, column, text, name, unit, median, low, high, runs, better."""
+    kept = ("row", "column", "text", "name", "unit", "better")
+    return pd.DataFrame([{name: getattr(one, name) for name in kept} | vars(one.spread) for one in rows])
+
+
+def pivot(frame: pd.DataFrame, title: str, notes: tuple[str, ...] = ()) -> Grid:
+    """Rows by columns, both in the order of their first cells; empty where there is none.
+
+    Raises:
+        ValueError: two measurements in one cell.
+    """
+    wide = frame.pivot(index="row", columns="column", values="text")
+    wide = wide.reindex(index=frame["row"].unique(), columns=frame["column"].unique()).fillna("")
+    rows = tuple((str(label), *map(str, cells)) for label, cells in zip(wide.index, wide.to_numpy(), strict=True))
+    return Grid(title, ("", *map(str, wide.columns)), rows, notes)
+
+
+def busy(*others_cores: float | None) -> tuple[str, ...]:
+    """A note where other processes disturbed what a table shows."""
+    busiest = max((cores or 0.0 for cores in others_cores), default=0.0)
+    if is_quiet(busiest):
+        return ()
+    return (f"other processes kept {busiest:.1f} cores busy meanwhile: {_AGAIN}",)
+
+
+def verdict(reached: bool, others_cores: float | None = None) -> str:
+    """What became of a target; a busy machine proves no target missed."""
+    return "reached" if reached else "missed" if is_quiet(others_cores) else "can't tell"
+
+
+def show_grid(grid: Grid, console: Console) -> None:
+    """Print a table; where it is too wide, its columns go on in another one below, behind the same first column."""
+    console.print(Text(grid.title, "bold"))
+    for part in fitting(grid, console.width):
+        table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
+        for index, heading in enumerate(part.heading):
+            stacked = Text("\n".join(heading.rsplit(" ", 1)))
+            table.add_column(stacked, justify="right" if index else "left", no_wrap=bool(index))
+        for row in part.rows:
+            table.add_row(*map(_coloured, row))
+        console.print(table)
+    for note in grid.notes:
+        console.print(Text(f"  {note}", "red" if note.endswith(_AGAIN) else "dim"))
+    console.print()
+
+
+def fitting(grid: Grid, width: int) -> Iterator[Grid]:
+    """``grid`` in parts that fit ``width`` columns, each with the first column."""
+    cells = [(*heading.rsplit(" ", 1), *column) for heading, *column in zip(grid.heading, *grid.rows, strict=True)]
+    sizes = [max(map(len, column)) + _AROUND for column in cells]
+    start, count = 1, len(sizes)
+    while start < count:
+        end, room = start + 1, width - min(sizes[0], _LABEL) - sizes[start]
+        while end < count and sizes[end] <= room:
+            room -= sizes[end]
+            end += 1
+        heading, *rows = ((row[0], *row[start:end]) for row in (grid.heading, *grid.rows))
+        yield Grid(grid.title, heading, tuple(rows), grid.notes)
+        start = end
+
+
+def _coloured(cell: str) -> Text:
+    text = Text(cell)
+    for word, colour in _VERDICTS.items():
+        text.highlight_regex(f"{word}$", colour)
+    return text
