@@ -16,8 +16,8 @@ from vestcl.bench.common import timing as _timing
 from vestcl.bench.splat import bench as splat
 from vestcl.bench.splat import measure as _measure
 from vestcl.bench.splat import scenes as _scenes
-from vestcl.bench.splat import torch_fragments as _fragments
-from vestcl.bench.splat import torch_peers as _peers
+from vestcl.bench.splat import torch_peer as _peer
+from vestcl.bench.splat.kernels import facts_of
 
 #: Nothing runs longer than its least number of rounds.
 TINY: dict[str, Any] = {"height": 24, "width": 50, "seconds": 1e-3, "compile": False}
@@ -28,15 +28,15 @@ def scene() -> _scenes.Scene:
     return _scenes.street(24, 50, 5, 1.7)
 
 
-def twin(scene: _scenes.Scene) -> torch.Tensor:
+def by_reference(scene: _scenes.Scene) -> torch.Tensor:
     arrays = (scene.points_uv, scene.z, scene.radii, scene.opacities, scene.features)
     return reference.splat(*arrays, scene.height, scene.width)[0]
 
 
-def assert_like_twin(scene: _scenes.Scene, kind: str) -> None:
+def assert_like_reference(scene: _scenes.Scene) -> None:
     """Image and gradients within the operator's own tolerance."""
     recording, exact = scene.requiring_grad(), scene.double().requiring_grad()
-    image, truth = _peers.splat(recording, kind), twin(exact)
+    image, truth = _peer.splat(recording), by_reference(exact)
     assert_close(image, truth, "image")
     grads = torch.autograd.grad(image, recording.leaves, recording.grad_image)
     truths = torch.autograd.grad(truth, exact.leaves, exact.grad_image)
@@ -71,16 +71,14 @@ def test_a_run_writes_and_prints_everything(
             assert 0 < speed[name]["time"]["low"] <= speed[name]["time"]["median"] <= speed[name]["time"]["high"]
             assert speed[name]["time"]["runs"] >= _timing.LEAST_ROUNDS
             assert speed[name]["copies"]["spread"]["median"] > 0
-    assert [[peer["name"] for peer in result["peers"]] for result in results["peers"]] == [
-        ["vestcl", *_peers.KINDS]
-    ] * 2
+    assert [[peer["name"] for peer in result["peers"]] for result in results["peers"]] == [["vestcl", "sparse"]] * 2
     assert results["speed"][0]["forward"]["copies"]["target"] is None, "targets hold for 256x832"
     assert all(max(peer["errors"].values()) < 2e-6 for result in results["peers"] for peer in result["peers"])
     assert {kernel["name"] for kernel in results["kernels"][0]["kernels"]} >= {"count_tiles", "clear_gradients"}
     assert len(results["memory"]) == 2
     assert [speed["facts"]["channels"] for speed in results["channels"]] == [1, 3, 1, 3]
     assert [speed["facts"]["width"] for speed in results["scaling"]] == [16, 32, 16, 32]
-    for text in ("x copy", "forward + backward", "index_add", "PyTorch3D is not installed", "GB/s", "pixels^"):
+    for text in ("x copy", "forward + backward", "sparse", "PyTorch3D is not installed", "GB/s", "pixels^"):
         assert text in printed
 
 
@@ -98,9 +96,9 @@ def test_without_a_compiler_the_peers_run_as_they_are(
     def fail() -> None:
         raise RuntimeError("no C++ compiler\nand a long story")
 
-    monkeypatch.setattr(_peers, "compiled_expand", fail)
+    monkeypatch.setattr(_peer, "compiled_expand", fail)
     expanding, compiled = splat._expanding(splat.SplatBench(), splat.Console())
-    assert expanding is _fragments.expand
+    assert expanding is _peer.expand
     assert not compiled
     assert capsys.readouterr().out == "peers without torch.compile: no C++ compiler\n"
 
@@ -118,17 +116,15 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("double", [False, True], ids=["float32", "float64"])
-@pytest.mark.parametrize("kind", _peers.KINDS)
-def test_peers_agree_with_the_twin(kind: str, double: bool, scene: _scenes.Scene) -> None:
-    assert_like_twin(scene.double() if double else scene, kind)
+def test_the_peer_agrees_with_the_reference(double: bool, scene: _scenes.Scene) -> None:
+    assert_like_reference(scene.double() if double else scene)
 
 
-@pytest.mark.parametrize("kind", _peers.KINDS)
-def test_peers_show_nothing_behind_an_opaque_point(kind: str) -> None:
+def test_the_peer_shows_nothing_behind_an_opaque_point() -> None:
     centre = torch.tensor([[[2.5, 1.5], [2.5, 1.5], [0.5, 0.5]]])
     z, ones = torch.tensor([[2.0, 1.0, 0.05]]), torch.ones(1, 3)
     features = torch.tensor([[[5.0, 6.0], [7.0, 8.0], [9.0, 9.0]]])
-    image = _peers.splat(_scenes.Scene(centre, z, ones, ones, features, torch.zeros(1, 2, 3, 4)), kind)
+    image = _peer.splat(_scenes.Scene(centre, z, ones, ones, features, torch.zeros(1, 2, 3, 4)))
     wanted = torch.zeros(1, 2, 3, 4)
     wanted[0, :, 1, 2] = torch.tensor([7.0, 8.0])
     assert torch.equal(image, wanted)
@@ -149,7 +145,7 @@ def test_facts(scene: _scenes.Scene) -> None:
     rows, columns = torch.meshgrid(torch.arange(24) + 0.5, torch.arange(50) + 0.5, indexing="ij")
     centres = torch.stack([columns, rows], -1).view(1, -1, 2)
     hits = (centres - scene.points_uv[0, :, None]).square().sum(-1) < 1.7**2
-    facts = _measure.facts_of(scene)
+    facts = facts_of(scene)
     assert facts.fragments == int(hits.sum())
     assert facts.most_layers == int(hits.sum(0).max())
     assert facts.points == 24 * 50
@@ -173,10 +169,10 @@ def test_tasks_take_turns_without_garbage_collection() -> None:
 
 def test_a_busy_machine_decides_nothing() -> None:
     spread, cores = _timing.Spread(3.0, 2.0, 4.0, 5), _timing.os.cpu_count()
-    assert _measure.Ratio.at_most(spread, 4.0, _timing.Others(0.0)).reached is True
-    assert _measure.Ratio.at_least(spread, 4.0, _timing.Others(None)).reached is False
-    assert _measure.Ratio.at_least(spread, 2.0, _timing.Others(0.5 * cores)).reached is None
-    assert _measure.Ratio.at_least(spread, None, _timing.Others(0.0)).reached is None
+    assert _measure.ratio(spread, 4.0, 0.0)["reached"] is True
+    assert _measure.ratio(spread, 4.0, None, at_most=False)["reached"] is False
+    assert _measure.ratio(spread, 2.0, 0.5 * cores, at_most=False)["reached"] is None
+    assert _measure.ratio(spread, None, 0.0, at_most=False)["reached"] is None
 
 
 def test_spread_is_median_and_quartiles() -> None:

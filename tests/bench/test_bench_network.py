@@ -11,7 +11,7 @@ from rich.console import Console
 
 from vestcl.bench.common.timing import Spread
 from vestcl.bench.network import bench as network
-from vestcl.bench.network.bench import NetworkBench, Part, Stopwatch, TimedForecaster, Timing
+from vestcl.bench.network.bench import NetworkBench, Stopwatch, TimedForecaster
 from vestcl.constants import SKY_DEPTH
 from vestcl.data.street.raycast import STREET_SKY_DEPTH as STREET_SKY
 from vestcl.models import configuration
@@ -99,8 +99,9 @@ def test_a_busy_machine_proves_no_target_missed(
     capsys: pytest.CaptureFixture[str], cores: float, seconds: float, verdict: str
 ) -> None:
     spread = Spread(seconds, seconds, seconds, 1)
-    part = Part("title", [Timing("forward", spread, spread)], 1.0, cores)
-    network._show(NetworkBench(), Console(width=140), part)
+    timings = [{"name": "forward", "wall": spread, "cpu": spread}]
+    part = {"title": "title", "timings": timings, "peak_gigabytes": 1.0, "others_cores": cores}
+    network.show(NetworkBench(), Console(width=140), part)
     printed = " ".join(capsys.readouterr().out.split())
     assert f"<= 2000 {verdict}" in printed and ("measure again" in printed) == (cores > 1)
 

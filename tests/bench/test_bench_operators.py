@@ -10,7 +10,7 @@ import torch
 from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.timing import LEAST_ROUNDS
-from vestcl.bench.splat import operators
+from vestcl.bench.splat import kernels, operators, roofline
 from vestcl.bench.splat.operators import PASSES, OperatorsBench
 
 #: Nothing runs longer than its least number of rounds.
@@ -37,7 +37,7 @@ def test_a_run_writes_and_prints_everything(
         assert measure.low <= measure.median <= measure.high
         assert measure.low > 0 or measure.name.endswith("around kernels"), measure.name
     for one in result.details["operators"]:
-        assert one["time"]["runs"] >= LEAST_ROUNDS and one["kernels"]["runs"] == operators.CALLS
+        assert one["time"]["runs"] >= LEAST_ROUNDS and one["kernels"]["runs"] == kernels.CALLS
         assert one["error"] < 1e-4, "operator and twin do the same"
     text = files["markdown"].read_text(encoding="utf-8")
     for name in names:
@@ -62,6 +62,23 @@ def assert_trace_shows(events: list[dict[str, Any]]) -> None:
     assert inside(stages[f"unproject {PASSES[0]}, vestcl"], "kernel") == ["unproject"]
     assert inside(stages[f"unproject {PASSES[1]}, vestcl"], "kernel") == ["unproject", "unproject_backward"]
     assert inside(stages[f"unproject {PASSES[1]}, twin"], "kernel") == []
+
+
+def test_the_roofline_is_an_option(
+    session: opencl.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(roofline, "CALLS", 1)
+    path = tmp_path / "results.json"
+    operators.main(
+        OperatorsBench(**TINY, roofline=True, device=session.info.index, json=path, plots=tmp_path / "plots")
+    )
+    (result,) = _results.load(path)
+    names = [measure.name for measure in result.measures]
+    assert "splat forward" in names and "roofline bandwidth, radius 1" in names and len(names) == len({*names})
+    (found,) = result.details["rooflines"]
+    assert found["facts"]["points"] == 16 * 24 and len(found["points"]) >= 6
+    assert "Roofline, 16x24, C = 5, radius 1 px" in capsys.readouterr().out
+    assert len(list((tmp_path / "plots").glob("*.png"))) == 3
 
 
 def test_bytes_are_those_of_the_arrays() -> None:

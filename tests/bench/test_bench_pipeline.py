@@ -16,7 +16,7 @@ from vestcl.bench.common.timing import Spread
 from vestcl.bench.pipeline import report as _pipeline_report
 from vestcl.bench.pipeline import traffic as _traffic
 from vestcl.bench.pipeline.bench import PipelineBench, load, main
-from vestcl.bench.pipeline.measure import ALL, NONE, PEER, SWITCHES, TWICE, Pictures, SceneTimes, Stepper, variants
+from vestcl.bench.pipeline.measure import ALL, NONE, PEER, SWITCHES, TWICE, Stepper, variants
 from vestcl.bench.pipeline.traffic import EMPTY, EVERYTHING, JAM, STREETS, TRAFFIC, drive
 from vestcl.models.config import EncoderConfig
 from vestcl.models.forecaster import Forecaster
@@ -188,10 +188,12 @@ def test_verdicts(name: str, of_peer: float, saved: float, loss: float | None, c
     def always(value: float) -> Spread:
         return Spread(value, value, value, 1)
 
-    pictures = Pictures(50.0, None if loss is None else 30 + loss, None if loss is None else 30.0)
-    share = {ALL: always(saved)}
-    scene = SceneTimes(name, 0.1, {}, {}, share, {}, {}, {}, always(of_peer), always(9), pictures, cores)
-    assert [verdict.word for verdict in _pipeline_report.verdicts([scene])] == words
+    pictures = {"truth_nothing": None, "truth_all": None}
+    if loss is not None:
+        pictures = {"truth_nothing": 30 + loss, "truth_all": 30.0}
+    scene = {"name": name, "saved_share": {ALL: always(saved)}, "of_peer": always(of_peer), "pictures": pictures}
+    targets = _pipeline_report.verdicts(scene | {"others_cores": cores})
+    assert [_pipeline_report.word(target) for target in targets] == words
 
 
 def test_load_takes_quality_and_precision(tmp_path: Path) -> None:

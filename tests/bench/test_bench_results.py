@@ -16,9 +16,9 @@ from rich.console import Console
 from vestcl import doctor, opencl
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
+from vestcl.bench.common import table as _table
 from vestcl.bench.common.results import Measure, Results
 from vestcl.bench.common.timing import Spread
-from vestcl.bench.splat import report as _report
 from vestcl.evaluation.tables import Grid
 
 
@@ -204,7 +204,8 @@ def test_plots_are_pictures(tmp_path: Path) -> None:
     lines = [_plots.Curve("a", [64, 256], SPREADS, 1e3), _plots.Curve("b", [64, 256], SPREADS[::-1], dashed=True)]
     curves = _plots.curves(tmp_path / "new" / "curves.png", "title", "points", "ms", lines)
     groups = {"a": {"x": SPREADS[0], "y": SPREADS[1]}, "b": {"y": SPREADS[0]}}
-    bars = [_plots.bars(tmp_path / f"{log}.png", "title", "ms", groups, 1e3, log=log) for log in (False, True)]
+    kinds = [{}, {"log": True}, {"stacked": True}]
+    bars = [_plots.bars(tmp_path / f"{number}.png", "title", "ms", groups, **kind) for number, kind in enumerate(kinds)]
     for path in (curves, *bars):
         picture = np.asarray(Image.open(path).convert("L"))
         assert picture.shape[1] == 1200 and picture.shape[0] >= 300
@@ -225,9 +226,9 @@ def test_file_names() -> None:
 
 
 def test_verdicts_are_coloured_and_text_is_no_markup(console: Console) -> None:
-    grid = Grid("[b]title", ("", "target"), (("[red]a", "<= 6 reached"), ("b", "missed it")), _report.busy(1e6))
-    console.print(_report.screen(grid))
+    grid = Grid("[b]title", ("", "target"), (("[red]a", "<= 6 reached"), ("b", "missed it")), _table.busy(1e6))
+    _table.show_grid(grid, console)
     plain, styled = console.export_text(clear=False), console.export_text(styles=True)
     assert "[b]title" in plain and "[red]a" in plain and "measure again" in " ".join(plain.split())
     assert "\x1b[32mreached" in styled and "\x1b[31mmissed" not in styled
-    assert _report.busy(0.0, None) == ()
+    assert _table.busy(0.0, None) == ()

@@ -10,10 +10,8 @@ import torch
 
 from vestcl import opencl
 from vestcl.bench.splat import roofline as _roofline
-from vestcl.bench.splat.kernels import bytes_of, flops_of
-from vestcl.bench.splat.measure import Facts, facts_of
-from vestcl.bench.splat.roofline import RooflineBench
-from vestcl.bench.splat.roofs import Roofline, roofline
+from vestcl.bench.splat.kernels import Facts, bytes_of, facts_of, flops_of
+from vestcl.bench.splat.roofline import RooflineBench, roofline
 from vestcl.bench.splat.scenes import Scene, street
 
 SIZE = (32, 48)
@@ -22,27 +20,28 @@ COPY_BYTES = 1 << 16
 
 
 @pytest.fixture
-def measured(mapped_session: opencl.Session) -> tuple[Scene, Roofline]:
+def measured(mapped_session: opencl.Session) -> tuple[Scene, dict[str, Any]]:
     scene = street(*SIZE, CHANNELS, 1.0)
     return scene, roofline(scene, calls=2, copy_bytes=COPY_BYTES)
 
 
-def test_each_kernel_once_with_a_share(measured: tuple[Scene, Roofline], mapped_session: opencl.Session) -> None:
+def test_each_kernel_once_with_a_share(measured: tuple[Scene, dict[str, Any]], mapped_session: opencl.Session) -> None:
     scene, result = measured
-    names = [point.name for point in result.points]
+    names = [point["name"] for point in result["points"]]
     wanted = {"tile": ["sort_tiles", "composite_tiles"], "pixel": ["sort_tiles_together", "composite_pixels"]}
     assert names[:2] == ["count_tiles", "fill_tiles"]
     assert set(wanted[mapped_session.mapping]) <= set(names)
     assert len(set(names)) == len(names)
-    assert result.bandwidth.median > 0 < result.peak.median
-    for point in result.points:
-        by_memory, by_compute = point.moved_bytes / result.bandwidth.median, point.flops / result.peak.median
-        least = max(by_memory, by_compute)
-        assert point.share.low <= point.share.median <= point.share.high
-        assert least / point.time.high <= point.share.high * 1.001
-        assert point.bound == ("memory" if by_memory >= by_compute else "compute")
-    assert result.kernels > 0
-    assert result.facts == facts_of(scene)
+    bandwidth, peak = result["bandwidth"].median, result["peak"].median
+    assert bandwidth > 0 < peak
+    for point in result["points"]:
+        by_memory, by_compute = point["moved_bytes"] / bandwidth, point["flops"] / peak
+        least, share = max(by_memory, by_compute), point["share"]
+        assert share.low <= share.median <= share.high
+        assert least / point["time"].high <= share.high * 1.001
+        assert point["bound"] == ("memory" if by_memory >= by_compute else "compute")
+    assert result["kernels"] > 0
+    assert result["facts"] == facts_of(scene)
 
 
 def test_bytes_and_flops_by_hand(session: opencl.Session) -> None:
@@ -75,16 +74,17 @@ def test_flops_grow_with_fragments_and_channels() -> None:
         assert flops_of(facts)[name] < wider[name]
 
 
-def test_table_figures_and_plot(measured: tuple[Scene, Roofline], tmp_path: Path) -> None:
+def test_table_figures_and_plot(measured: tuple[Scene, dict[str, Any]], tmp_path: Path) -> None:
     from matplotlib.image import imread
 
     _, result = measured
-    table = _roofline.grid(result)
-    assert [row[0] for row in table.rows] == [*(p.name for p in result.points), "all kernels", "no kernel running"]
-    assert {len(row) for row in table.rows} == {len(table.heading)}
-    figures = _roofline.measures(result)
-    assert len({figure.name for figure in figures}) == len(figures) == 2 + len(result.points)
-    picture = imread(_roofline.plot(tmp_path / "deep" / "roofline.png", result))
+    names = [point["name"] for point in result["points"]]
+    section = _roofline.section(result, tmp_path / "deep")
+    assert [row[0] for row in section.grid().rows] == [*names, "all kernels", "no kernel running"]
+    figures = [row.name for row in section.rows if row.name]
+    assert len({*figures}) == len(figures) == 2 + len(names)
+    (path,) = (tmp_path / "deep").iterdir()
+    picture = imread(path)
     assert picture.shape[0] > 400 < picture.shape[1]
     assert len(np.unique(picture[..., :3].reshape(-1, 3), axis=0)) > 10
 

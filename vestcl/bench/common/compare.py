@@ -4,29 +4,27 @@ A measure has changed where the ranges between its quartiles don't overlap. Wher
 the same bytes beside it, that ratio must have changed in the same direction, too: else it is the machine that changed.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
+import numpy as np
+import pandas as pd  # type: ignore[import-untyped]
 import tyro
 from rich.text import Text
 
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.results import X_COPY, Measure, Results
-from vestcl.bench.splat import report as _report
+from vestcl.bench.common.table import SHOWN, show_grid
 from vestcl.evaluation.tables import Grid, to_markdown
 from vestcl.io import atomic
 
-Verdict = Literal["better", "worse", "noise", "machine"]
-
 #: Settings that say where results go, and nothing about what is measured; and what always differs.
-_OUTPUTS: Final = ("json", "markdown", "plots", "trace")
-_DATE: Final = "date"
+_IGNORED: Final = {"machine": ("date",), "config": ("json", "markdown", "plots", "trace")}
 
-#: Unit of a measure -> how tables show it, and the factor to that.
-_SHOWN: Final = {"s": ("ms", 1e3), "B": ("MB", 1e-6), "1": ("", 1.0)}
+#: Units that tables show as others.
+_UNITS: Final = {"s": "ms", "B": "MB", "1": ""}
 
 
 @dataclass(frozen=True)
@@ -43,23 +41,6 @@ class CompareBench:
     """File for the tables."""
 
 
-@dataclass(frozen=True)
-class Change:
-    """One measure of both runs."""
-
-    before: Measure
-    after: Measure
-    percent: float
-    """100 (after / before - 1) of the medians; NaN where there is none."""
-    verdict: Verdict
-    """ "noise": the quartiles' ranges overlap. "machine": they don't, but the ratio to the copy is the same."""
-
-    @property
-    def loss(self) -> float:
-        """By how many percent it got worse; negative where better, NaN where unknown."""
-        return self.percent if self.after.better == "lower" else -self.percent
-
-
 def main(config: CompareBench) -> int:
     """Print all changes.
 
@@ -73,19 +54,24 @@ def main(config: CompareBench) -> int:
     if config.fail_above is not None and not config.fail_above >= 0:
         raise ValueError(f"`fail_above` must be 0 or more, got {config.fail_above}")
     console = _results.console()
-    grids, failed = [], []
+    grids, failed = list[Grid](), list[str]()
     for before, after in pairs(_results.load(config.before), _results.load(config.after)):
         for warning in warnings(before, after):
             console.print(Text(f"warning: {warning}", "yellow"), soft_wrap=True)
         changes = compare(before.measures, after.measures)
         grids.append(_grid(before, after, changes))
-        console.print(_report.screen(grids[-1]))
-        failed += [change for change in changes if _fails(change, config.fail_above)]
+        show_grid(grids[-1], console)
+        if config.fail_above is not None:
+            # From 0 to something is no percentage, and still worse.
+            above = changes[(changes["verdict"] == "worse") & ~(changes["loss"] <= config.fail_above)]
+            failed += [
+                f"{name}: worse by {loss:.1f} %, more than {config.fail_above:g} %"
+                for name, loss in zip(above["name"], above["loss"], strict=True)
+            ]
     if config.markdown is not None:
         atomic.write_bytes(config.markdown, "\n".join(map(to_markdown, grids)).encode())
-    for change in failed:
-        told = f"{change.after.name}: worse by {change.loss:.1f} %, more than {config.fail_above:g} %"
-        console.print(Text(told, "red"), soft_wrap=True)
+    for line in failed:
+        console.print(Text(line, "red"), soft_wrap=True)
     return 1 if failed else 0
 
 
@@ -108,60 +94,53 @@ def pairs(before: Sequence[Results], after: Sequence[Results]) -> list[tuple[Res
 
 
 def warnings(before: Results, after: Results) -> Iterator[str]:
-    """What else differs: device, versions, settings; and measures that one run alone has."""
-    ignored = {"machine": (_DATE,), "config": _OUTPUTS}
-    for field, names in ignored.items():
+    """What else differs: device, versions, settings; and measures that only one run has."""
+    for field, ignored in _IGNORED.items():
         one, two = getattr(before, field), getattr(after, field)
         for name in dict.fromkeys((*one, *two)):
-            if name not in names and one.get(name) != two.get(name):
+            if name not in ignored and one.get(name) != two.get(name):
                 yield f"{name} differs: {one.get(name)} before, {two.get(name)} after"
     names_of = [{measure.name for measure in result.measures} for result in (before, after)]
-    for when, alone in (("before", names_of[0] - names_of[1]), ("after", names_of[1] - names_of[0])):
-        if alone:
-            yield f"only {when}: {', '.join(sorted(alone))}"
+    for when, names in (("before", names_of[0] - names_of[1]), ("after", names_of[1] - names_of[0])):
+        if names:
+            yield f"only {when}: {', '.join(sorted(names))}"
 
 
-def compare(before: Sequence[Measure], after: Sequence[Measure]) -> list[Change]:
-    """Every measure that both have, in the order of ``before``.
+def compare(before: Sequence[Measure], after: Sequence[Measure]) -> pd.DataFrame:
+    """Every measure that both have, in the order of ``before``, a row each.
+
+    Returns:
+        "name", "unit"; "median", "low" and "high" of both, as "median_before" and so on; "percent",
+        100 (after / before - 1) of the medians, NaN where there is none; "loss", the percent by which it got worse; and
+        "verdict": "noise" where the quartiles' ranges overlap; "machine" where they don't, but the ratio to the copy
+        did not change; "better" or "worse".
 
     Raises:
         ValueError: a measure in different units.
     """
-    one, two = ({measure.name: measure for measure in measures} for measures in (before, after))
-    moved = {name: _moved(one[name], two[name]) for name in one if name in two}
-    return [_change(one[name], two[name], moved[name], moved.get(name + X_COPY)) for name in moved]
+    columns = list(Measure.__dataclass_fields__)
+    runs = (pd.DataFrame([vars(measure) for measure in measures], columns=columns) for measures in (before, after))
+    both = pd.merge(*runs, on="name", suffixes=("_before", ""))
+    for one in both[both["unit"] != both["unit_before"]].itertuples():
+        raise ValueError(f"`after` must have {one.name} in {one.unit_before!r}, got {one.unit!r}")
+    moved = (both["low"] > both["high_before"]).astype(int) - (both["high"] < both["low_before"]).astype(int)
+    of_copy = (both["name"] + X_COPY).map(dict(zip(both["name"], moved, strict=True))).fillna(moved)
+    less = both["better"] == "lower"
+    percent = 100 * (both["median"] / both["median_before"].replace(0, np.nan) - 1)
+    known = [moved == 0, of_copy != moved, (moved < 0) == less]
+    verdict = np.select(known, ["noise", "machine", "better"], "worse")
+    both = both.rename(columns={name: f"{name}_after" for name in ("median", "low", "high")})
+    return both.assign(percent=percent, loss=percent.where(less, -percent), verdict=verdict)
 
 
-def _change(before: Measure, after: Measure, moved: int, of_copy: int | None) -> Change:
-    """``moved``: -1, 0 or 1; ``of_copy``: the same of its ratio to the copy, where there is one."""
-    if before.unit != after.unit:
-        raise ValueError(f"`after` must have {before.name} in {before.unit!r}, got {after.unit!r}")
-    percent = 100 * (after.median / before.median - 1) if before.median else math.nan
-    if not moved:
-        return Change(before, after, percent, "noise")
-    if of_copy is not None and of_copy != moved:
-        return Change(before, after, percent, "machine")
-    return Change(before, after, percent, "better" if (moved < 0) == (after.better == "lower") else "worse")
-
-
-def _moved(before: Measure, after: Measure) -> int:
-    """1 where the second range is above the first, -1 where below, 0 where they overlap or one is unknown."""
-    return int(after.low > before.high) - int(after.high < before.low)
-
-
-def _fails(change: Change, limit: float | None) -> bool:
-    """From 0 to something is no percentage, and still worse."""
-    return limit is not None and change.verdict == "worse" and not change.loss <= limit
-
-
-def _grid(before: Results, after: Results, changes: Sequence[Change]) -> Grid:
+def _grid(before: Results, after: Results, changes: pd.DataFrame) -> Grid:
     rows = []
-    for change in changes:
-        unit, factor = _SHOWN.get(change.after.unit, (change.after.unit, 1.0))
-        ranges = (_range(measure, factor) for measure in (change.before, change.after))
-        rows.append((change.after.name, unit, *ranges, f"{change.percent:+.1f}", change.verdict))
+    for change in changes.to_dict("records"):
+        ranges = (_range(change, when) for when in ("before", "after"))
+        unit = _UNITS.get(change["unit"], change["unit"])
+        rows.append((change["name"], unit, *ranges, f"{change['percent']:+.1f}", change["verdict"]))
     names = (result.machine.get("device", "unknown device") for result in (before, after))
-    dates = " -> ".join(result.machine.get(_DATE, "?") for result in (before, after))
+    dates = " -> ".join(result.machine.get("date", "?") for result in (before, after))
     title = f"vestcl bench {after.bench}, {' -> '.join(dict.fromkeys(names))}, {dates}"
     notes = (
         "noise: the ranges between the quartiles overlap. machine: they don't, but the ratio to the copy stays, so the",
@@ -170,6 +149,7 @@ def _grid(before: Results, after: Results, changes: Sequence[Change]) -> Grid:
     return Grid(title, ("", "unit", "before (quartiles)", "after (quartiles)", "change, %", ""), tuple(rows), notes)
 
 
-def _range(measure: Measure, factor: float) -> str:
-    median, low, high = (f"{value * factor:.4g}" for value in (measure.median, measure.low, measure.high))
+def _range(change: dict[str, float], when: str) -> str:
+    factor = SHOWN.get(str(change["unit"]), 1.0)
+    median, low, high = (f"{change[f'{part}_{when}'] * factor:.4g}" for part in ("median", "low", "high"))
     return median if low == high else f"{median} ({low}-{high})"

@@ -33,7 +33,7 @@ ALL: Final = "all"
 X_COPY: Final = ", x copy"
 
 #: Columns of tables that don't go to a terminal.
-WIDTH: Final = 140
+WIDTH: Final = 80
 
 #: Of the files: the value of "vestcl".
 _FORMAT: Final = 1
@@ -240,13 +240,18 @@ def describe(session: opencl.Session) -> dict[str, str]:
         **versions,
         "python": platform.python_version(),
         "system": platform.platform(),
-        "device": f"{session.info.index} {session.info.platform} / {session.info.name}",
+        "device": device_name(session),
         "driver": session.info.driver,
         "compute units": str(session.info.compute_units),
         "mapping": session.mapping,
         "processor": _processor(),
         "cores": str(os.cpu_count()),
     }
+
+
+def device_name(session: opencl.Session) -> str:
+    """ "0:0 PLATFORM / NAME"."""
+    return f"{session.info.index} {session.info.platform} / {session.info.name}"
 
 
 def _processor() -> str:

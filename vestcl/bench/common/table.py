@@ -37,6 +37,9 @@ _AGAIN: Final = "measure again"
 #: Columns of the screen around a cell.
 _AROUND: Final = 3
 
+#: As long as a heading gets in one line.
+_HEADING: Final = 8
+
 #: As wide as a first column gets before its text is wrapped.
 _LABEL: Final = 38
 
@@ -137,8 +140,7 @@ def show_grid(grid: Grid, console: Console) -> None:
     for part in fitting(grid, console.width):
         table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
         for index, heading in enumerate(part.heading):
-            stacked = Text("\n".join(heading.rsplit(" ", 1)))
-            table.add_column(stacked, justify="right" if index else "left", no_wrap=bool(index))
+            table.add_column(Text(_stacked(heading)), justify="right" if index else "left", no_wrap=bool(index))
         for row in part.rows:
             table.add_row(*map(_coloured, row))
         console.print(table)
@@ -149,7 +151,7 @@ def show_grid(grid: Grid, console: Console) -> None:
 
 def fitting(grid: Grid, width: int) -> Iterator[Grid]:
     """``grid`` in parts that fit ``width`` columns, each with the first column."""
-    cells = [(*heading.rsplit(" ", 1), *column) for heading, *column in zip(grid.heading, *grid.rows, strict=True)]
+    cells = [(*_stacked(heading).split("\n"), *of) for heading, *of in zip(grid.heading, *grid.rows, strict=True)]
     sizes = [max(map(len, column)) + _AROUND for column in cells]
     start, count = 1, len(sizes)
     while start < count:
@@ -160,6 +162,11 @@ def fitting(grid: Grid, width: int) -> Iterator[Grid]:
         heading, *rows = ((row[0], *row[start:end]) for row in (grid.heading, *grid.rows))
         yield Grid(grid.title, heading, tuple(rows), grid.notes)
         start = end
+
+
+def _stacked(heading: str) -> str:
+    """The last word of a long heading goes below the others."""
+    return "\n".join(heading.rsplit(" ", 1)) if len(heading) > _HEADING else heading
 
 
 def _coloured(cell: str) -> Text:

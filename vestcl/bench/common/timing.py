@@ -4,10 +4,11 @@ import contextlib
 import ctypes
 import gc
 import os
-import platform
 import random
+import resource
+import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+
+from vestcl.models.inference.fast import keep_freed_memory
 
 Task = Callable[[], object]
 
@@ -30,9 +33,8 @@ PAUSE: Final = 0.01
 #: The share of the machine that other processes may keep busy before no target counts as reached or missed.
 QUIET_SHARE: Final = 0.05
 
-#: Of glibc's mallopt: the two parameters, what `recycling_allocator` sets, and glibc's defaults.
-_MMAP_MAX: Final = (-4, 0, 65536)
-_TRIM_THRESHOLD: Final = (-1, 2**31 - 1, 128 * 1024)
+#: Of glibc's mallopt: what `recycling_allocator` changes, and glibc's defaults (M_MMAP_MAX, M_TRIM_THRESHOLD).
+_DEFAULTS: Final = ((-4, 65536), (-1, 128 * 1024))
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,11 @@ class Spread:
     def of(cls, values: NDArray[np.float64]) -> "Spread":
         low, median, high = np.percentile(values, [25, 50, 75])
         return cls(float(median), float(low), float(high), len(values))
+
+    @classmethod
+    def of_each(cls, runs: Sequence[Mapping[str, float]]) -> "dict[str, Spread]":
+        """By name, of runs that all have the same names."""
+        return {name: cls.of(np.array([run[name] for run in runs])) for name in runs[0]}
 
 
 def interleave(tasks: Mapping[str, Task], seconds: float, least: int = LEAST_ROUNDS) -> dict[str, NDArray[np.float64]]:
@@ -97,14 +104,12 @@ def recycling_allocator() -> Iterator[bool]:
 
     Yields whether it does; other C libraries are left as they are.
     """
-    keeps = platform.libc_ver()[0] == "glibc"
-    mallopt: Any = ctypes.CDLL(None).mallopt if keeps else lambda *_: None
-    for parameter, value, _ in (_MMAP_MAX, _TRIM_THRESHOLD):
-        mallopt(parameter, value)
+    keeps = keep_freed_memory()
     try:
         yield keeps
     finally:
-        for parameter, _, default in (_MMAP_MAX, _TRIM_THRESHOLD):
+        mallopt: Any = ctypes.CDLL(None).mallopt if keeps else lambda *_: None
+        for parameter, default in _DEFAULTS:
             mallopt(parameter, default)
 
 
@@ -117,6 +122,12 @@ def torch_threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def peak_gigabytes() -> float:
+    """The most memory that the process has had resident, GB."""
+    units = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * units / 1e9
 
 
 def copies_of_forward(features: torch.Tensor, threads: int) -> dict[str, Task]:

@@ -2,24 +2,21 @@
 
 import contextlib
 import dataclasses
-import resource
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import torch
-from rich import box
 from rich.console import Console
-from rich.table import Table
 from torch import nn
 
 from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
+from vestcl.bench.common.options import DeviceOptions
+from vestcl.bench.common.table import Measurement, Section, busy, show_grid, verdict
 from vestcl.bench.common.timing import Spread
 from vestcl.data import Frame, Street, intrinsics
 from vestcl.data.street.raycast import STREET_SKY_DEPTH
@@ -45,12 +42,22 @@ WARM_UP: Final = 1
 #: Stage: unproject, rigid flow, displace and splat, forward and backward; a part of the others.
 OPENCL: Final = "all OpenCL, both ways"
 
+#: Methods of a `Forecaster`, and as tables name them.
+STAGES: Final = {
+    "encode": "encode",
+    "move_camera": "camera motion (EMF)",
+    "move_objects": "object motion (OMF)",
+    "lift": "lift",
+    "splat": "displace and splat",
+    "paint": "refine",
+}
+
 #: Of Adam (SPEC section 7).
 LEARNING_RATE: Final = 1e-4
 
 
 @dataclass(frozen=True)
-class NetworkBench:
+class NetworkBench(DeviceOptions):
     """Time the network on two frames of a street, with true depth and labels."""
 
     model: str = "vest-s"
@@ -67,33 +74,8 @@ class NetworkBench:
     """Of the training step."""
     seed: int = 0
     """Of the street and the weights."""
-    threads: int = 2
-    """Of torch."""
-    device: str | None = None
+    device: str | None = field(default=None, kw_only=True)
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
-    json: Path | None = None
-    """File for the results."""
-
-
-@dataclass(frozen=True)
-class Timing:
-    """One part of the work, in seconds a run: wall time, and the CPU time of all threads."""
-
-    name: str
-    wall: Spread
-    cpu: Spread
-
-
-@dataclass(frozen=True)
-class Part:
-    """A forecast or a training step, its stages first and the whole last."""
-
-    title: str
-    timings: list[Timing]
-    peak_gigabytes: float
-    """The most memory that the process has taken so far."""
-    others_cores: float | None
-    """That other processes kept busy meanwhile."""
 
 
 @dataclass
@@ -111,40 +93,31 @@ class Stopwatch:
         self.cpu[name] = self.cpu.get(name, 0.0) + time.process_time() - cpu
 
 
-#: Deviation of the last layers' weights of object motion: next to nothing, metres.
+#: Deviation of the last layers' weights of object motion, metres: as it is made it changes nothing, and would not run
+#: where it does not learn.
 _STIRRED: Final = 1e-5
+
+Model = TypeVar("Model", bound=Forecaster)
 
 
 class TimedForecaster(Forecaster):
-    """A `Forecaster` that tells its stages' times."""
+    """A `Forecaster` whose stages report their times, wall and CPU, to its ``watch``."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__(config)
         self.watch = Stopwatch()
 
-    def encode(self, *arguments: Any) -> Any:
-        with self.watch.time("encode"):
-            return super().encode(*arguments)
 
-    def move_camera(self, *arguments: Any) -> Any:
-        with self.watch.time("camera motion (EMF)"):
-            return super().move_camera(*arguments)
+def _timed(method: str, name: str) -> Callable[..., Any]:
+    def stage(self: TimedForecaster, *arguments: Any) -> Any:
+        with self.watch.time(name):
+            return getattr(Forecaster, method)(self, *arguments)
 
-    def move_objects(self, *arguments: Any) -> Any:
-        with self.watch.time("object motion (OMF)"):
-            return super().move_objects(*arguments)
+    return stage
 
-    def lift(self, *arguments: Any) -> Any:
-        with self.watch.time("lift"):
-            return super().lift(*arguments)
 
-    def splat(self, *arguments: Any) -> Any:
-        with self.watch.time("displace and splat"):
-            return super().splat(*arguments)
-
-    def paint(self, *arguments: Any) -> Any:
-        with self.watch.time("refine"):
-            return super().paint(*arguments)
+for _method, _name in STAGES.items():
+    setattr(TimedForecaster, _method, _timed(_method, _name))
 
 
 def main(config: NetworkBench) -> None:
@@ -159,16 +132,14 @@ def main(config: NetworkBench) -> None:
     console = _results.console()
     with opencl.use(config.device) as session, _timing.torch_threads(config.threads):
         machine = _results.describe(session)
-        for name, value in machine.items():
-            console.print(f"{name}: {value}", soft_wrap=True, highlight=False)
-        torch.manual_seed(config.seed)
-        model = _in_use(TimedForecaster(model_config))
+        _results.show_machine(machine, console)
+        model = made(TimedForecaster, model_config, config.seed)
+        model.skip = dataclasses.replace(model.skip, seen=False)  # the frames are the same ones in all runs
         frames, K = street_frames(config.height, config.width, config.seed)
         parts = list(_parts(config, console, model, frames, torch.from_numpy(K)[None].float()))
     if config.json is not None:
-        settings = dataclasses.asdict(config) | {"json": str(config.json)}
-        results = {"machine": machine, "config": settings, "parts": [dataclasses.asdict(part) for part in parts]}
-        _results.write_json(config.json, results)
+        results = {"machine": machine, "config": _results.settings(config), "parts": parts}
+        _results.write_json(config.json, _results.plain(results))
         _results.tell_written(console, config.json)
 
 
@@ -186,9 +157,10 @@ def street_layers(frame: Frame) -> LayerBatch:
     return layers.batch([layers.build_layers(frame.colour[0], frame.depth[0], background(frame.labels[0]), sky=sky)])
 
 
-def _in_use(model: TimedForecaster) -> TimedForecaster:
-    """With object motion that does something, and frames encoded each time: they are the same ones in all runs."""
-    model.skip = dataclasses.replace(model.skip, seen=False)
+def made(kind: type[Model], config: ModelConfig, seed: int) -> Model:
+    """A network as at the start of a training, but with object motion that does something."""
+    torch.manual_seed(seed)
+    model = kind(config)
     for block in () if model.object_motion is None else model.object_motion.blocks:
         for parameter in block.get_submodule("out").parameters():
             nn.init.normal_(parameter, std=_STIRRED)
@@ -202,7 +174,7 @@ def prior_of(model: Forecaster, frame: LayerBatch) -> MotionPrior | None:
 
 def _parts(
     config: NetworkBench, console: Console, model: TimedForecaster, frames: Sequence[Frame], K: torch.Tensor
-) -> Iterator[Part]:
+) -> Iterator[dict[str, Any]]:
     """Measure and print part after part. Memory only grows, so the training step comes last."""
 
     def several(tensor: torch.Tensor) -> torch.Tensor:
@@ -215,7 +187,7 @@ def _parts(
             return model(*pair, K, prior=prior_of(model, pair[1]))
 
     model.eval()
-    yield _show(config, console, _measure(f"{config.model}, forecast", model, forecast, "forward", config.runs))
+    yield show(config, console, _measure(f"{config.model}, forecast", model, forecast, "forward", config.runs))
     if config.training:
         pair = [LayerBatch(*map(several, street_layers(frame))) for frame in frames[:2]]
         truth, cameras = several(torch.from_numpy(frames[2].colour)), several(K)
@@ -226,7 +198,7 @@ def _parts(
                 train_once(model, adam, pair, truth, cameras)
 
         title = f"{config.model}, training, batch {config.batch}"
-        yield _show(config, console, _measure(title, model, train, "training step", config.runs))
+        yield show(config, console, _measure(title, model, train, "training step", config.runs))
 
 
 def train_once(
@@ -249,7 +221,8 @@ def train_once(
     return loss.item()
 
 
-def _measure(title: str, model: TimedForecaster, task: Callable[[], object], whole: str, runs: int) -> Part:
+def _measure(title: str, model: TimedForecaster, task: Callable[[], object], whole: str, runs: int) -> dict[str, Any]:
+    """A forecast or a training step, its stages first and the whole last; memory is the most that was taken so far."""
     for _ in range(WARM_UP):
         task()
     watches = []
@@ -258,51 +231,30 @@ def _measure(title: str, model: TimedForecaster, task: Callable[[], object], who
             model.watch = Stopwatch()
             task()
             watches.append(model.watch)
-    names = sorted(watches[0].wall, key=lambda name: name == whole)
-    timings = [
-        Timing(
-            name, *(Spread.of(np.array([getattr(watch, kind)[name] for watch in watches])) for kind in ("wall", "cpu"))
-        )
-        for name in names
-    ]
-    return Part(title, timings, peak_gigabytes(), others.cores)
+    wall, cpu = (Spread.of_each([getattr(watch, kind) for watch in watches]) for kind in ("wall", "cpu"))
+    names = sorted(wall, key=lambda name: name == whole)
+    timings = [{"name": name, "wall": wall[name], "cpu": cpu[name]} for name in names]
+    memory = {"peak_gigabytes": _timing.peak_gigabytes(), "others_cores": others.cores}
+    return {"title": title, "timings": timings, **memory}
 
 
-def peak_gigabytes() -> float:
-    """The most memory that the process has had resident, GB."""
-    units = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * units / 1e9
-
-
-def _show(config: NetworkBench, console: Console, part: Part) -> Part:
-    """Print ``part`` beside its targets, and hand it on."""
-    targets = TARGETS.get((config.model, config.height, config.width), {})
-    title = f"{part.title}, {config.height}x{config.width}, {config.threads} threads"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
-    for column in ("", "ms (quartiles)", "CPU ms", "target"):
-        table.add_column(column, justify="right" if column else "left")
-    for timing in part.timings:
-        target = targets.get(timing.name)
-        verdict = "" if target is None else f"<= {target * 1e3:.0f} {_verdict(timing.wall.median <= target, part)}"
-        cpu = "" if timing.name == OPENCL else f"{timing.cpu.median * 1e3:.0f}"
-        table.add_row(timing.name, _ms(timing.wall), cpu, verdict)
-    memory = targets.get("memory")
-    verdict = "" if memory is None else f"<= {memory:g} {_verdict(part.peak_gigabytes <= memory)}"
-    table.add_row("peak memory, GB", f"{part.peak_gigabytes:.2f}", "", verdict)
-    if not _timing.is_quiet(part.others_cores):
-        table.caption = f"other processes kept {part.others_cores:.1f} cores busy meanwhile: measure again"
-        table.caption_style, table.caption_justify = "red", "left"
-    console.print(table)
+def show(config: NetworkBench, console: Console, part: dict[str, Any]) -> dict[str, Any]:
+    """Print what `_measure` found beside its targets, and hand it on."""
+    targets, cores = TARGETS.get((config.model, config.height, config.width), {}), part["others_cores"]
+    rows = list[Measurement]()
+    for timing in part["timings"]:
+        name, wall = timing["name"], timing["wall"]
+        rows.append(Measurement(name, "ms (quartiles)", wall, "s"))
+        if name != OPENCL:
+            rows.append(Measurement(name, "CPU ms", timing["cpu"], "s", ".0f"))
+        if name in targets:
+            word = verdict(wall.median <= targets[name], cores)
+            rows.append(Measurement(name, "target", f"<= {targets[name] * 1e3:.0f} {word}"))
+    memory = part["peak_gigabytes"]
+    rows.append(Measurement("peak memory, GB", "ms (quartiles)", f"{memory:.2f}"))
+    if "memory" in targets:
+        word = verdict(memory <= targets["memory"])
+        rows.append(Measurement("peak memory, GB", "target", f"<= {targets['memory']:g} {word}"))
+    title = f"{part['title']}, {config.height}x{config.width}, {config.threads} threads"
+    show_grid(Section(title, rows, busy(cores)).grid(), console)
     return part
-
-
-def _ms(spread: Spread) -> str:
-    return f"{spread.median * 1e3:.0f} ({spread.low * 1e3:.0f}-{spread.high * 1e3:.0f})"
-
-
-def _verdict(reached: bool, timed: Part | None = None) -> str:
-    """A time that is too long on a machine with other work proves nothing."""
-    if reached:
-        return "[green]reached[/]"
-    disturbed = timed is not None and not _timing.is_quiet(timed.others_cores)
-    return "[yellow]can't tell[/]" if disturbed else "[red]missed[/]"

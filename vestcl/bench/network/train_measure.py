@@ -1,10 +1,10 @@
 """Training steps in turns: everything learns, or a part is frozen; and a small one whose splat is plain torch's."""
 
 import copy
+import itertools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -13,19 +13,22 @@ from torch import nn
 from vestcl import opencl
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.timing import Spread
-from vestcl.bench.network.backward import BackwardWatch
 from vestcl.bench.network.bench import LEARNING_RATE
-from vestcl.bench.pipeline.splatter import by_twin
+from vestcl.bench.pipeline.splatter import by_reference
 from vestcl.bench.pipeline.traffic import Window
+from vestcl.forecasting.network.input import NetworkInput
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference.stage_times import watching, with_rest
-from vestcl.models.networks.layers import joined
-from vestcl.models.steps.prior import MotionPrior
+from vestcl.models.inference.stage_times import REST, watching, with_rest
+from vestcl.models.networks.layers import joined, tensors_in
 from vestcl.opencl import trace
-from vestcl.scene.layers import LayerBatch
 
-#: Variant -> networks that are frozen, by their attributes of `Forecaster`. Autograd records nothing that leads to a
-#: frozen one alone, and OpenCL's backward computes no gradient that nobody asks for.
+Record = dict[str, Any]
+
+Batch = tuple[NetworkInput, torch.Tensor]
+"""What one step learns from: its input, and the frames at t + 1 [B, 3, H, W]."""
+
+#: Variant -> networks that are frozen, by their attributes of `Forecaster`. Autograd records nothing that leads only to
+#: frozen ones, and OpenCL's backward computes no gradient that nobody asks for.
 FROZEN: Final[dict[str, tuple[str, ...]]] = {
     "everything learns": (),
     "encoder frozen": ("encoder",),
@@ -37,64 +40,42 @@ EVERYTHING_LEARNS: Final = next(iter(FROZEN))
 #: Parts of a step.
 FORWARD, BACKWARD, ADAM = "forward", "backward", "Adam"
 
-#: A small step's splat: ours, and the plain torch twin's.
+#: A small step's splat: ours, and the torch reference's.
 OURS, TWIN = "OpenCL", "torch"
 
 
-class Batch(NamedTuple):
-    """What one step learns from."""
-
-    frame_prev: LayerBatch
-    frame_cur: LayerBatch
-    K: torch.Tensor
-    """[B, 3, 3] px."""
-    prior: MotionPrior
-    truth: torch.Tensor
-    """[B, 3, H, W], the frame at t + 1."""
-
-
 def stacked(windows: Sequence[Window]) -> Batch:
-    """Windows of a street as one batch.
-
-    Args:
-        windows: one or more, of one size, each with its truth.
-    """
+    """Windows of a street, one or more, of one size, each with its truth, as one batch."""
     truths = [window.truth for window in windows if window.truth is not None]
     assert len(truths) == len(windows) > 0
-    given = joined([window.given for window in windows])
-    return Batch(given.frame_prev, given.frame_cur, given.K, given.prior, torch.cat(truths))
+    return joined([window.given for window in windows]), torch.cat(truths)
 
 
-@dataclass(frozen=True)
-class StepTimes:
-    """One variant's figures, s a step."""
+class BackwardWatch:
+    """Seconds of the backward pass by stage.
 
-    name: str
-    whole: Spread
-    parts: dict[str, Spread]
-    """By FORWARD, BACKWARD and ADAM."""
-    forward: dict[str, Spread]
-    """By stage."""
-    backward: dict[str, Spread]
-    """By stage."""
-    opencl: Spread
-    """Time in OpenCL, forward and backward, a part of the others."""
-    saved_share: Spread
-    """Of the step in which everything learns, round by round."""
-    parameters: int
-    """That learn."""
-    others_cores: float | None
+    On a CPU autograd runs the last operation's gradient first. So a stage's backward begins when the gradient of one of
+    its results is there, and lasts until that of an earlier stage's result is. What comes before the first is the
+    loss's; rigid flow, between EMF and OMF, counts as OMF's.
+    """
 
+    def __init__(self) -> None:
+        self._began: list[tuple[float, str]] = []
 
-@dataclass(frozen=True)
-class TwinTimes:
-    """A small step of batch 1, with each splat."""
+    def seen(self, name: str, result: Any) -> None:
+        """Watch for the gradients of a stage's results; for `vestcl.models.inference.stage_times.watching`."""
+        for tensor in tensors_in(result):
+            if tensor.requires_grad:
+                tensor.register_hook(lambda _: self._began.append((time.perf_counter(), name)))
 
-    whole: dict[str, Spread]
-    splat: dict[str, Spread]
-    """Forward and backward of that stage alone."""
-    gradient_difference: float
-    """Largest difference of a parameter's gradient as a share of the largest gradient of that parameter."""
+    def backward(self, loss: torch.Tensor) -> dict[str, float]:
+        """loss.backward(); seconds by stage, and of the loss as REST."""
+        self._began = [(time.perf_counter(), REST)]
+        loss.backward()
+        began, seconds = [*self._began, (time.perf_counter(), REST)], dict[str, float]()
+        for (start, name), (end, _) in itertools.pairwise(began):
+            seconds[name] = seconds.get(name, 0.0) + end - start
+        return seconds
 
 
 class Trainer:
@@ -124,91 +105,82 @@ class Trainer:
         with trace.stage(ADAM):
             self._adam.step()
         parts = {FORWARD: forward - start, BACKWARD: end - forward, ADAM: time.perf_counter() - end}
-        stages = with_rest(watch.seconds, parts[FORWARD])
-        device = {"": session.seconds - busy}
-        back = with_rest(backward, parts[BACKWARD])
-        self.runs.append({"parts": parts, FORWARD: stages, BACKWARD: back, "opencl": device})
+        stages, back = with_rest(watch.seconds, parts[FORWARD]), with_rest(backward, parts[BACKWARD])
+        self.runs.append({"parts": parts, FORWARD: stages, BACKWARD: back, "opencl": {"": session.seconds - busy}})
 
     def loss(self) -> torch.Tensor:
         """Mean |image - truth|, with all gradients cleared."""
         self._adam.zero_grad(set_to_none=True)
-        batch = self._batch
-        prior = batch.prior if self.model.config.start == "prior" else None
-        step = self.model(batch.frame_prev, batch.frame_cur, batch.K, prior=prior)
-        return nn.functional.l1_loss(step.views[0].image, batch.truth)
-
-    def spreads(self, what: str, count: int) -> dict[str, Spread]:
-        """Of the last ``count`` runs."""
-        runs = [run[what] for run in self.runs[-count:]]
-        return {name: Spread.of(np.array([run[name] for run in runs])) for name in runs[0]}
+        given, truth = self._batch
+        prior = given.prior if self.model.config.start == "prior" else None
+        step = self.model(given.frame_prev, given.frame_cur, given.K, prior=prior)
+        return nn.functional.l1_loss(step.views[0].image, truth)
 
 
-def measure_steps(model: Forecaster, batch: Batch, seconds: float) -> list[StepTimes]:
-    """Every variant of FROZEN, in turns.
+def measure_steps(model: Forecaster, batch: Batch, seconds: float) -> list[Record]:
+    """Every variant of FROZEN, in turns; times are seconds a step.
 
     Args:
         model: in training mode; it stays as it is.
         batch: that all learn from.
         seconds: about how long it takes.
+
+    Returns:
+        Of each "name", "whole", "parts" by FORWARD, BACKWARD and ADAM, FORWARD and BACKWARD by stage, "opencl" (forward
+        and backward, a part of the others), "saved_share" of the step in which everything learns, round by round,
+        "parameters" that learn, "others_cores".
     """
     trainers = {name: Trainer(model, frozen, batch) for name, frozen in FROZEN.items()}
     with _timing.recycling_allocator(), _timing.watching_others() as others:
         times = _timing.interleave({name: trainer.step for name, trainer in trainers.items()}, seconds)
-    base, found = times[EVERYTHING_LEARNS], []
+    found = []
     for name, trainer in trainers.items():
-        count, whole = len(base), times[name]
-        parts, forward, backward, opencl = (
-            trainer.spreads(what, count) for what in ("parts", FORWARD, BACKWARD, "opencl")
-        )
-        saved = Spread.of(1 - whole / base)
-        found.append(
-            StepTimes(
-                name,
-                Spread.of(whole),
-                parts,
-                forward,
-                backward,
-                opencl[""],
-                saved,
-                trainer.parameters,
-                others.cores,
-            )
-        )
+        runs = trainer.runs[-len(times[name]) :]
+        kinds: Record = {kind: Spread.of_each([run[kind] for run in runs]) for kind in ("parts", FORWARD, BACKWARD)}
+        kinds |= Spread.of_each([{"opencl": run["opencl"][""]} for run in runs])
+        saved = Spread.of(1 - times[name] / times[EVERYTHING_LEARNS])
+        about = {"saved_share": saved, "parameters": trainer.parameters, "others_cores": others.cores}
+        found.append({"name": name, "whole": Spread.of(times[name]), **kinds, **about})
     return found
 
 
-def measure_twin(model: Forecaster, batch: Batch, seconds: float) -> TwinTimes:
-    """A step with OpenCL's splat and one with the torch twin's, in turns; all else is the same.
+def measure_twin(model: Forecaster, batch: Batch, seconds: float) -> Record:
+    """A step with OpenCL's splat and one with the torch reference's, in turns; all else is the same.
 
     Args:
         model: in training mode; it stays as it is.
-        batch: small: the twin takes every fragment through torch's indexing.
+        batch: small: the reference takes every fragment through torch's indexing.
         seconds: about how long it takes.
-    """
-    ours, twins = Trainer(model, (), batch), Trainer(model, (), batch)
-    difference = _gradient_difference(ours, twins)
 
-    def with_twin() -> None:
-        with by_twin():
-            twins.step()
+    Returns:
+        By OURS and TWIN "whole" and "splat", seconds of the step and of forward and backward of that stage;
+        "gradient_difference", the largest of a parameter as a share of the largest gradient of that parameter.
+    """
+    trainers = {OURS: Trainer(model, (), batch), TWIN: Trainer(model, (), batch)}
+    difference = _gradient_difference(trainers[OURS], trainers[TWIN])
+
+    def with_reference() -> None:
+        with by_reference():
+            trainers[TWIN].step()
 
     with _timing.recycling_allocator():
-        times = _timing.interleave({OURS: ours.step, TWIN: with_twin}, seconds)
+        times = _timing.interleave({OURS: trainers[OURS].step, TWIN: with_reference}, seconds)
     splat = {
         name: Spread.of(
             np.array([run[FORWARD]["splat"] + run[BACKWARD]["splat"] for run in trainer.runs[-len(times[name]) :]])
         )
-        for name, trainer in ((OURS, ours), (TWIN, twins))
+        for name, trainer in trainers.items()
     }
-    return TwinTimes({name: Spread.of(found) for name, found in times.items()}, splat, difference)
+    whole = {name: Spread.of(found) for name, found in times.items()}
+    return {"whole": whole, "splat": splat, "gradient_difference": difference}
 
 
-def _gradient_difference(ours: Trainer, twins: Trainer) -> float:
+def _gradient_difference(ours: Trainer, theirs: Trainer) -> float:
     ours.loss().backward()
-    with by_twin():
-        twins.loss().backward()
+    with by_reference():
+        theirs.loss().backward()
     worst = 0.0
-    for one, other in zip(ours.model.parameters(), twins.model.parameters(), strict=True):
+    for one, other in zip(ours.model.parameters(), theirs.model.parameters(), strict=True):
         if one.grad is not None and other.grad is not None and other.grad.any():
             worst = max(worst, ((one.grad - other.grad).abs().max() / other.grad.abs().max()).item())
     return worst

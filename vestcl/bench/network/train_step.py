@@ -1,40 +1,43 @@
 """`vestcl bench train-step`: a training step by stage, what gradients cost that nobody asks for, and torch's splat."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-import torch
 from rich.console import Console
-from torch import nn
 
 from vestcl import opencl
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
-from vestcl.bench.common import timing as _timing
-from vestcl.bench.common.results import Results
-from vestcl.bench.network import train_report as _train_report
-from vestcl.bench.network.bench import peak_gigabytes
-from vestcl.bench.network.train_measure import Batch, StepTimes, TwinTimes, measure_steps, measure_twin, stacked
+from vestcl.bench.common.options import Options
+from vestcl.bench.common.table import Measurement, Section, busy
+from vestcl.bench.common.timing import peak_gigabytes
+from vestcl.bench.network.bench import made
+from vestcl.bench.network.train_measure import (
+    ADAM,
+    BACKWARD,
+    EVERYTHING_LEARNS,
+    FORWARD,
+    OURS,
+    TWIN,
+    Batch,
+    Record,
+    measure_steps,
+    measure_twin,
+    stacked,
+)
 from vestcl.bench.pipeline.bench import SEED
 from vestcl.bench.pipeline.traffic import LEAST_FRAMES, TRAFFIC, drive
-from vestcl.evaluation.tables import Grid
 from vestcl.models import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster
-from vestcl.opencl import trace
-
-#: Deviation of the last layers' weights of object motion, metres: as it is made it changes nothing, and would not run
-#: where it does not learn.
-_STIRRED: Final = 1e-5
 
 #: (height, width) at which torch's splat takes part in a step: it is thousands of times slower at full size.
 TWIN_SIZE: Final = (32, 112)
 
 
 @dataclass(frozen=True)
-class TrainStepBench:
+class TrainStepBench(Options):
     """Time a training step, forward, backward and Adam, on streets with true depth and labels."""
 
     model: str = "vest-s"
@@ -51,18 +54,6 @@ class TrainStepBench:
     """About how long the measurement takes."""
     twin: bool = True
     """A small step with torch's splat in place of OpenCL's, too."""
-    threads: int = 2
-    """Of torch."""
-    device: str | None = None
-    """OpenCL device: an index of `vestcl devices`, a part of its name, or "all": every one that works."""
-    json: Path | None = None
-    """File for the results."""
-    markdown: Path | None = None
-    """File for the tables."""
-    plots: Path | None = None
-    """Folder for plots (PNG)."""
-    trace: Path | None = None
-    """File for a trace of stages and kernels, which ui.perfetto.dev opens; times are a bit longer meanwhile."""
 
 
 def main(config: TrainStepBench) -> None:
@@ -73,57 +64,78 @@ def main(config: TrainStepBench) -> None:
         DeviceError: no such device.
     """
     _results.check_positive(config, "height", "width", "batch", "seconds", "threads")
-    model_config = configuration(config.model)
-    console = _results.console()
-    with trace.record(config.trace), _timing.torch_threads(config.threads):
-        results = _results.measure_each(config.device, partial(_measure_device, config, model_config, console), console)
-    _results.save(results, config.json, config.markdown)
-    _results.tell_written(console, config.json, config.markdown, config.trace, config.plots)
+    _results.run("train-step", config, partial(_sections, config, configuration(config.model)))
 
 
-def _measure_device(
-    config: TrainStepBench, model_config: ModelConfig, console: Console, session: opencl.Session
-) -> Results:
-    """Everything on one device."""
-    machine = _results.describe(session)
-    _results.show_machine(machine, console)
-    model = made(model_config, config.seed)
+def _sections(
+    config: TrainStepBench, model_config: ModelConfig, session: opencl.Session, console: Console
+) -> Iterator[Section]:
+    """Everything on one device: variants, stages, and torch's splat."""
+    model = made(Forecaster, model_config, config.seed).train()
     with console.status("training steps"):
         steps = measure_steps(model, _batch(config, config.height, config.width, config.batch), config.seconds)
-    twin = None
+    size = f"{config.model}, {config.height}x{config.width}, batch {config.batch}"
+    notes = (
+        f"{steps[0]['whole'].runs} rounds. OpenCL's share of a step is a part of {FORWARD} and {BACKWARD}.",
+        *busy(steps[0]["others_cores"]),
+    )
+    rows = [row for step in steps for row in _variant_rows(step)]
+    yield Section(f"training step, {size}", rows, notes, {"steps": steps, "twin": None, "twin_size": TWIN_SIZE})
+    note = "Medians. A stage's backward lasts from the gradient of its first result to that of an earlier stage's."
+    rows = [
+        Measurement(stage, f"{step['name']}, {way}", spread, "s", ".1f", f"{step['name']}: {way}: {stage}")
+        for step in steps
+        for way in (FORWARD, BACKWARD)
+        for stage, spread in step[way].items()
+    ]
+    yield Section("stages, ms", rows, (note,))
     if config.twin:
         with console.status("a step with torch's splat"):
             twin = measure_twin(model, _batch(config, *TWIN_SIZE, 1), config.seconds / 4)
-    size = f"{config.model}, {config.height}x{config.width}, batch {config.batch}"
-    grids = _train_report.grids(steps, twin, size, "x".join(map(str, TWIN_SIZE)))
-    _results.show([Results("train-step", {}, {}, [], grids, {})], console)
+        yield _twin_section(twin)
+    yield Section("", [], details={"peak_gigabytes": peak_gigabytes()})
     if config.plots is not None:
-        path = config.plots / _plots.file_name(f"train step {machine['device']}")
-        _train_report.plot(path, f"training step, {size}, {machine['device']}", steps)
-    return _result(config, machine, steps, twin, grids)
-
-
-def _result(
-    config: TrainStepBench,
-    machine: dict[str, str],
-    steps: Sequence[StepTimes],
-    twin: TwinTimes | None,
-    grids: list[Grid],
-) -> Results:
-    details = {"steps": steps, "twin": twin, "twin_size": TWIN_SIZE, "peak_gigabytes": peak_gigabytes()}
-    measures = _train_report.measures(steps, twin)
-    return Results("train-step", machine, _results.settings(config), measures, grids, dict(_results.plain(details)))
-
-
-def made(config: ModelConfig, seed: int) -> Forecaster:
-    """A network as at the start of a training, but with object motion that does something."""
-    torch.manual_seed(seed)
-    model = Forecaster(config)
-    for block in () if model.object_motion is None else model.object_motion.blocks:
-        for parameter in block.get_submodule("out").parameters():
-            nn.init.normal_(parameter, std=_STIRRED)
-    return model.train()
+        device = _results.device_name(session)
+        path = config.plots / _plots.file_name(f"train step {device}")
+        _plots.bars(path, f"training step, {size}, {device}", "ms a step", _bars(steps), stacked=True)
 
 
 def _batch(config: TrainStepBench, height: int, width: int, count: int) -> Batch:
     return stacked(drive(TRAFFIC, height, width, max(LEAST_FRAMES, count + 2), config.seed).windows[:count])
+
+
+def _variant_rows(step: Record) -> Iterator[Measurement]:
+    name = step["name"]
+    yield Measurement(name, "parameters", f"{step['parameters']:,}")
+    yield Measurement(name, "step, ms (quartiles)", step["whole"], "s", name=name)
+    if name != EVERYTHING_LEARNS:
+        yield Measurement(name, "saved", step["saved_share"], "1", "+.1%", f"{name}: saved", "higher")
+    for part in (FORWARD, BACKWARD, ADAM):
+        yield Measurement(name, f"{part}, ms", step["parts"][part], "s", name=f"{name}: {part}")
+    yield Measurement(name, "", step["opencl"], "s", name=f"{name}: OpenCL")
+    yield Measurement(name, "OpenCL's share", f"{step['opencl'].median / step['whole'].median:.1%}")
+
+
+def _twin_section(twin: Record) -> Section:
+    ratio, worst = twin["splat"][TWIN].median / twin["splat"][OURS].median, twin["gradient_difference"]
+    rows = [Measurement("", "", worst, name="small step: gradients' difference")]
+    for by in (OURS, TWIN):
+        row, name = f"splat by {by}", f"small step, splat by {by}"
+        rows.append(Measurement(row, "step, ms (quartiles)", twin["whole"][by], "s", name=name))
+        rows.append(Measurement(row, "splat, both passes, ms", twin["splat"][by], "s", name=f"{name}: splat"))
+    notes = (
+        f"The stage takes {ratio:.1f} times as long in torch.",
+        f"Gradients of the weights differ by {worst:.0e} of the largest.",
+    )
+    size = "x".join(map(str, TWIN_SIZE))
+    return Section(f"training step with torch's splat, {size}, batch 1", rows, notes, {"twin": twin})
+
+
+def _bars(steps: Sequence[Record]) -> dict[str, dict[str, Any]]:
+    """By stage, forward above backward, variant by variant."""
+    bars: dict[str, dict[str, Any]] = {}
+    for step in steps:
+        for way in (FORWARD, BACKWARD):
+            for stage, spread in step[way].items():
+                bars.setdefault(stage, {})[f"{step['name']}, {way}"] = spread
+    return bars

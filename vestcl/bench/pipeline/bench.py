@@ -1,8 +1,8 @@
 """`vestcl bench pipeline`: a complete forecast step in empty streets and full ones, and what skipping saves of it."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Final, Literal
 
 import torch
@@ -11,11 +11,11 @@ from rich.console import Console
 from vestcl import opencl
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
-from vestcl.bench.common import timing as _timing
-from vestcl.bench.common.results import Results
-from vestcl.bench.network.bench import peak_gigabytes
-from vestcl.bench.pipeline import report as _pipeline_report
-from vestcl.bench.pipeline.measure import SceneTimes, measure_scene
+from vestcl.bench.common.options import Options
+from vestcl.bench.common.table import Section
+from vestcl.bench.common.timing import peak_gigabytes
+from vestcl.bench.pipeline import report as _report
+from vestcl.bench.pipeline.measure import measure_scene
 from vestcl.bench.pipeline.traffic import EMPTY, EVERYTHING, JAM, LEAST_FRAMES, TRAFFIC, drive
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import pretrained, quality
@@ -28,7 +28,7 @@ SEED: Final = 1100
 
 
 @dataclass(frozen=True)
-class PipelineBench:
+class PipelineBench(Options):
     """Time a forecast step, with depth and masks given, in an empty road, in traffic and in a jam."""
 
     model: str = "vest-s"
@@ -53,18 +53,6 @@ class PipelineBench:
     """The network as `vestcl.models.inference.fast.accelerate` lays it out."""
     peers: bool = True
     """Beside DMVFN's network on the same frames, too."""
-    threads: int = 2
-    """Of torch."""
-    device: str | None = None
-    """OpenCL device: an index of `vestcl devices`, a part of its name, or "all": every one that works."""
-    json: Path | None = None
-    """File for the results."""
-    markdown: Path | None = None
-    """File for the tables."""
-    plots: Path | None = None
-    """Folder for plots (PNG)."""
-    trace: Path | None = None
-    """File for a trace of stages and kernels, which ui.perfetto.dev opens; times are a bit longer meanwhile."""
 
 
 def main(config: PipelineBench) -> None:
@@ -75,12 +63,7 @@ def main(config: PipelineBench) -> None:
         DeviceError: no such device.
     """
     _check(config)
-    console = _results.console()
-    model = load(config)
-    with trace.record(config.trace), _timing.torch_threads(config.threads):
-        results = _results.measure_each(config.device, partial(_measure_device, config, model, console), console)
-    _results.save(results, config.json, config.markdown)
-    _results.tell_written(console, config.json, config.markdown, config.trace, config.plots)
+    _results.run("pipeline", config, partial(_sections, config, load(config)))
 
 
 def load(config: PipelineBench) -> Forecaster:
@@ -108,33 +91,22 @@ def _check(config: PipelineBench) -> None:
         raise ValueError("`scenes` must be one or more, got none")
 
 
-def _measure_device(config: PipelineBench, model: Forecaster, console: Console, session: opencl.Session) -> Results:
-    """All scenes on one device, printed as they come."""
-    machine = _results.describe(session)
-    _results.show_machine(machine, console)
-    scenes = [_measure(config, model, console, name) for name in dict.fromkeys(config.scenes)]
-    grids = _pipeline_report.grids(scenes, f"{model.config.name}, {config.height}x{config.width}")
-    _results.show([Results("pipeline", {}, {}, [], grids, {})], console)
+def _sections(config: PipelineBench, model: Forecaster, session: opencl.Session, console: Console) -> Iterator[Section]:
+    """All scenes on one device, as they come."""
+    size, scenes = f"{config.height}x{config.width}", []
+    for name in dict.fromkeys(config.scenes):
+        with console.status(name), trace.stage(name):
+            scene = drive(name, config.height, config.width, config.frames, config.seed)
+            scenes.append(measure_scene(model, scene, config.seconds, config.threads, config.peers))
+        yield _report.scene_section(scenes[-1], f"{model.config.name}, {size}")
+    yield from _report.sections(scenes)
+    counts = {
+        scene["name"]: {key: count._asdict() for key, count in (scene["counts"] | scene["splatter"]).items()}
+        for scene in scenes
+    }
+    about = {"skip": model.skip, "effort": model.effort, "autocast": model.autocast and str(model.autocast)}
+    about |= {"scenes": {scene["name"]: scene for scene in scenes}, "counts": counts}
+    yield Section("", [], details=about | {"peak_gigabytes": peak_gigabytes()})
     if config.plots is not None:
-        title = f"forecast step, {config.height}x{config.width}, {machine['device']}"
-        _pipeline_report.plot(config.plots / _plots.file_name(f"pipeline {machine['device']}"), title, scenes)
-    details = _results.plain({
-        "skip": model.skip,
-        "effort": model.effort,
-        "autocast": None if model.autocast is None else str(model.autocast),
-        "scenes": {scene.name: scene for scene in scenes},
-        "counts": {
-            scene.name: {key: count._asdict() for key, count in (scene.counts | scene.splatter).items()}
-            for scene in scenes
-        },
-        "targets": _pipeline_report.verdicts(scenes),
-        "peak_gigabytes": peak_gigabytes(),
-    })  # fmt: skip
-    measures = _pipeline_report.measures(scenes)
-    return Results("pipeline", machine, _results.settings(config), measures, grids, details)
-
-
-def _measure(config: PipelineBench, model: Forecaster, console: Console, name: str) -> SceneTimes:
-    with console.status(name), trace.stage(name):
-        scene = drive(name, config.height, config.width, config.frames, config.seed)
-        return measure_scene(model, scene, config.seconds, config.threads, config.peers)
+        path = config.plots / _plots.file_name(f"pipeline {_results.device_name(session)}")
+        _report.plot(path, f"forecast step, {size}, {_results.device_name(session)}", scenes)

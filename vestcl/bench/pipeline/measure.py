@@ -1,21 +1,20 @@
-"""A forecast step timed on one scene: nothing skipped, each switch alone and all, in turns with peers and a copy."""
+"""A forecast step on one scene: nothing skipped, each switch by itself and all, in turns with a peer and a copy."""
 
 import copy
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from vestcl.bench.common import timing as _timing
-from vestcl.bench.common.timing import Spread
+from vestcl.bench.common.timing import Spread, Task
 from vestcl.bench.pipeline.splatter import counting
-from vestcl.bench.pipeline.traffic import EMPTY, JAM, TRAFFIC, Drive, Window
+from vestcl.bench.pipeline.traffic import Drive, Window
 from vestcl.evaluation import metrics
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.skipping import NOTHING, Count, Skip, count_skips
@@ -23,6 +22,8 @@ from vestcl.models.inference.stage_times import watching, with_rest
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.opencl import trace
 from vestcl.scene.layers import build_layers
+
+Record = dict[str, Any]
 
 #: What else is timed beside the variants: the peer, a copy of the frames' layers, and what a new frame needs before.
 PEER, COPY, INPAINT = "DMVFN", "copy", "inpaint"
@@ -42,68 +43,25 @@ class Variant:
 
     name: str
     skip: Skip
-    twice: bool = False
-    """Whether the view is asked for twice."""
     base: str | None = None
     """The variant that it is compared with."""
     switch: str | None = None
-    """The one that is on, where it is one alone."""
+    """The one that is on, where it is only one."""
+
+    @property
+    def twice(self) -> bool:
+        """Whether the view is asked for twice."""
+        return TWICE in (self.name, self.base)
 
 
 def variants(skip: Skip) -> list[Variant]:
-    """Nothing skipped, each switch alone, and all that ``skip`` has on."""
+    """Nothing skipped, each switch by itself, and all that ``skip`` has on."""
     nothing = dataclasses.replace(NOTHING, margin=skip.margin, still=skip.still)
-    found = [Variant(NONE, nothing), Variant(TWICE, nothing, twice=True)]
+    found = [Variant(NONE, nothing), Variant(TWICE, nothing)]
     for switch in SWITCHES:
-        twice = switch == "views"
-        alone = dataclasses.replace(nothing, **{switch: True})
-        found.append(Variant(f"{switch} alone", alone, twice, TWICE if twice else NONE, switch))
-    return [*found, Variant(ALL, skip, base=NONE)]
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """What skipping changes, mean over a drive, dB PSNR; `inf` where nothing does."""
-
-    against_nothing: float
-    """Of the forecast with all skipped, against the one with nothing skipped."""
-    truth_nothing: float | None
-    """Of the forecast with nothing skipped, against the true frame; None without one."""
-    truth_all: float | None
-
-    @property
-    def loss(self) -> float | None:
-        """dB that skipping costs against the truth."""
-        return None if self.truth_nothing is None or self.truth_all is None else self.truth_nothing - self.truth_all
-
-
-@dataclass(frozen=True)
-class SceneTimes:
-    """One scene's figures. Steps that begin a drive, with no frame known, don't count."""
-
-    name: str
-    foreground: float
-    """Share of the pixels."""
-    seconds: dict[str, Spread]
-    """By variant, PEER, COPY and INPAINT."""
-    saved: dict[str, Spread]
-    """By variant that has a base: s a step, each against the base's step in the same round."""
-    saved_share: dict[str, Spread]
-    """The same as a share of the base's step."""
-    stages: dict[str, dict[str, Spread]]
-    """By variant and stage, s."""
-    counts: dict[str, Count]
-    """What each switch skipped, by switch, over the drive."""
-    splatter: dict[str, Count]
-    """What the splatter itself left out with all skipped, which has no switch: points that make no fragment, tiles
-    without points, pixels that nothing shines through any more."""
-    of_peer: Spread | None
-    """The step with all skipped as a multiple of PEER's, round by round; None where PEER did not run."""
-    of_copy: Spread
-    """The same of COPY's."""
-    pictures: Pictures
-    others_cores: float | None
-    """That other processes kept busy meanwhile."""
+        one, base = dataclasses.replace(nothing, **{switch: True}), TWICE if switch == "views" else NONE
+        found.append(Variant(f"{switch} alone", one, base, switch))
+    return [*found, Variant(ALL, skip, NONE)]
 
 
 class Stepper:
@@ -154,8 +112,8 @@ class Stepper:
         }
 
 
-def measure_scene(model: Forecaster, drive: Drive, seconds: float, threads: int, peer: bool) -> SceneTimes:
-    """Time a scene.
+def measure_scene(model: Forecaster, drive: Drive, seconds: float, threads: int, peer: bool) -> Record:
+    """Time a scene. Steps that begin a drive, with no frame known, don't count.
 
     Args:
         model: with the precision and effort that all variants have, and the switches that "all" has.
@@ -165,70 +123,62 @@ def measure_scene(model: Forecaster, drive: Drive, seconds: float, threads: int,
         peer: whether DMVFN runs, too.
 
     Returns:
-        The figures.
+        "name", "foreground" (share of the pixels), "others_cores"; by variant, PEER, COPY and INPAINT "seconds"; by
+        variant that has a base "saved", s of the base's step in the same round, and "saved_share" of it; by variant
+        and stage "stages", s; "counts", what each switch skipped; "splatter", what the splatter left out with all
+        skipped, which has no switch; "of_peer" and "of_copy", the step with all skipped as multiples of theirs;
+        "pictures", what skipping changes.
     """
     steppers = {variant.name: Stepper(model, variant, drive) for variant in variants(model.skip)}
-    tasks: dict[str, _timing.Task] = {name: stepper.step for name, stepper in steppers.items()}
+    tasks: dict[str, Task] = {name: stepper.step for name, stepper in steppers.items()}
     planes = torch.cat([plane for frame in drive.windows[0].frames for plane in frame], dim=1)
-    tasks[COPY] = _timing.copies_of_forward(planes, threads)["torch copy_"]
-    tasks[INPAINT] = _inpaint(drive)
-    if peer:
-        tasks[PEER] = _peer(drive)
+    tasks |= {COPY: _timing.copies_of_forward(planes, threads)["torch copy_"], INPAINT: _inpaint(drive)}
+    tasks |= {PEER: _peer(drive)} if peer else {}
     with torch.inference_mode(), _timing.recycling_allocator(), _timing.watching_others() as others:
         times = _timing.interleave(tasks, seconds, least=drive.warm + _timing.LEAST_ROUNDS)
     count = len(times[NONE])  # before those, tasks ran to get warm
     counted = np.array(steppers[NONE].places[-count:]) >= drive.warm
     times = {name: found[counted] for name, found in times.items()}
-    stages = {name: _spreads(stepper.stages[-count:], counted) for name, stepper in steppers.items()}
+    stages = {
+        name: Spread.of_each([run for run, counts in zip(one.stages[-count:], counted, strict=True) if counts])
+        for name, one in steppers.items()
+    }
     with torch.inference_mode():
         looks = {name: stepper.look() for name, stepper in steppers.items()}
         splatter = steppers[ALL].splatter()
-    kinds = [stepper.variant for stepper in steppers.values()]
-    bases = [(kind.name, times[kind.name], times[kind.base]) for kind in kinds if kind.base]
-    return SceneTimes(
-        drive.name,
-        drive.foreground,
-        {name: Spread.of(found) for name, found in times.items()},
-        {name: Spread.of(base - own) for name, own, base in bases},
-        {name: Spread.of(1 - own / base) for name, own, base in bases},
-        stages,
-        _counts(steppers, looks),
-        splatter,
-        Spread.of(times[ALL] / times[PEER]) if peer else None,
-        Spread.of(times[ALL] / times[COPY]),
-        _pictures(drive, looks[NONE][0], looks[ALL][0]),
-        others.cores,
-    )
+    switches = {one.variant.switch: looks[name][1] for name, one in steppers.items() if one.variant.switch}
+    saved = {
+        one.variant.name: (times[name], times[one.variant.base]) for name, one in steppers.items() if one.variant.base
+    }
+    return {
+        "name": drive.name,
+        "foreground": drive.foreground,
+        "seconds": {name: Spread.of(found) for name, found in times.items()},
+        "saved": {name: Spread.of(base - own) for name, (own, base) in saved.items()},
+        "saved_share": {name: Spread.of(1 - own / base) for name, (own, base) in saved.items()},
+        "stages": stages,
+        "counts": {switch: counts[switch] for switch, counts in switches.items() if switch in counts},
+        "splatter": splatter,
+        "of_peer": Spread.of(times[ALL] / times[PEER]) if peer else None,
+        "of_copy": Spread.of(times[ALL] / times[COPY]),
+        "pictures": _pictures(drive, looks[NONE][0], looks[ALL][0]),
+        "others_cores": others.cores,
+    }
 
 
-def _counts(steppers: dict[str, Stepper], looks: dict[str, tuple[Any, dict[str, Count]]]) -> dict[str, Count]:
-    """Of each switch, by its own variant."""
-    found = {}
-    for name, stepper in steppers.items():
-        switch = stepper.variant.switch
-        if switch is not None and switch in looks[name][1]:
-            found[switch] = looks[name][1][switch]
-    return found
-
-
-def _spreads(runs: Sequence[dict[str, float]], counted: NDArray[np.bool_]) -> dict[str, Spread]:
-    kept = [run for run, counts in zip(runs, counted, strict=True) if counts]
-    return {name: Spread.of(np.array([run[name] for run in kept])) for name in kept[0]}
-
-
-def _inpaint(drive: Drive) -> Callable[[], object]:
-    """The layers of one new frame, from its picture, depth and mask."""
+def _inpaint(drive: Drive) -> Task:
+    """The layers of one new frame, from its image, depth and mask."""
     frames = itertools.cycle([window.frames[1] for window in drive.windows])
 
     def build() -> object:
         frame = next(frames)
-        picture, depth, mask = (plane[0].numpy() for plane in (frame.image, frame.depth, frame.mask))
-        return build_layers(picture, depth, mask > 0)
+        image, depth, mask = (plane[0].numpy() for plane in (frame.image, frame.depth, frame.mask))
+        return build_layers(image, depth, mask > 0)
 
     return build
 
 
-def _peer(drive: Drive) -> Callable[[], object]:
+def _peer(drive: Drive) -> Task:
     """DMVFN's network on the same frames, all of its blocks."""
     windows, network = itertools.cycle(drive.windows), VoxelFlowNetwork().eval()
 
@@ -240,7 +190,8 @@ def _peer(drive: Drive) -> Callable[[], object]:
     return forecast
 
 
-def _pictures(drive: Drive, nothing: list[torch.Tensor], skipped: list[torch.Tensor]) -> Pictures:
+def _pictures(drive: Drive, nothing: list[torch.Tensor], skipped: list[torch.Tensor]) -> dict[str, float | None]:
+    """Mean PSNR over a drive, dB: with all skipped against nothing skipped, and both against the truth, if known."""
     truths = [window.truth for window in drive.windows[drive.warm :]]
 
     def mean(found: Sequence[torch.Tensor], wanted: Sequence[torch.Tensor | None]) -> float | None:
@@ -248,15 +199,5 @@ def _pictures(drive: Drive, nothing: list[torch.Tensor], skipped: list[torch.Ten
         known = [metrics.psnr(one.clamp(0, 1), other.clamp(0, 1)).item() for one, other in pairs]
         return float(np.mean(known)) if known else None
 
-    against = mean(skipped, nothing)
-    assert against is not None
-    return Pictures(against, mean(nothing, truths), mean(skipped, truths))
-
-
-#: Scene -> what the step may take as a multiple of PEER's, and what share of it skipping must save at least.
-OF_PEER: Final = {EMPTY: 0.25, TRAFFIC: 0.5, JAM: 0.5}
-SAVED: Final = {EMPTY: 0.4, TRAFFIC: 0.2}
-
-#: dB PSNR against the truth that skipping may cost, and share of a step where there is nothing to skip.
-MOST_LOSS: Final = 0.1
-MOST_COST: Final = 0.02
+    known = {"truth_nothing": mean(nothing, truths), "truth_all": mean(skipped, truths)}
+    return {"against_nothing": mean(skipped, nothing), **known}

@@ -1,77 +1,107 @@
-"""Where the time goes: every kernel of one forward + backward, from OpenCL events, and the bandwidth it reaches."""
+"""The kernels of a call: their time, from OpenCL events, and the bytes and flops that splat's must move and compute."""
 
-import statistics
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vestcl import opencl
-from vestcl.bench.common.timing import Spread, watching_others
-from vestcl.bench.splat.measure import Facts, both_passes, facts_of
+from vestcl.bench.common.timing import Task, watching_others
 from vestcl.bench.splat.scenes import Scene
+from vestcl.bench.splat.torch_peer import list_fragments
 from vestcl.ops.splat import rasterize
 
-#: Profiled calls.
+#: Profiled calls: medians of that many have settled.
 CALLS: Final = 15
 
 
 @dataclass(frozen=True)
-class Kernel:
-    """One kernel in one call of forward + backward."""
+class Facts:
+    """What a scene is made of."""
 
-    name: str
-    launches: int
-    time: Spread
-    """Of all launches of a call together."""
-    megabytes: float | None
-    """What it must move: every array that it reads or writes, once. None where that is not counted."""
-    gigabytes_per_second: float | None
+    height: int
+    width: int
+    channels: int
+    radius: float
+    points: int
+    shown_points: int
+    """Whose footprint reaches the image, and that are not in front of the near plane."""
+    fragments: int
+    most_layers: int
+    """On one pixel."""
+
+    @property
+    def size(self) -> str:
+        """ "256x832, C = 32, radius 1"."""
+        return f"{self.height}x{self.width}, C = {self.channels}, radius {self.radius:g}"
+
+    @property
+    def title(self) -> str:
+        """The same, and how much there is to do."""
+        return f"{self.size} px: {self.fragments:,} fragments, at most {self.most_layers} on a pixel"
 
 
 @dataclass(frozen=True)
 class Profile:
-    """The kernels of a call in the order of their first launch, and the call as a whole."""
+    """Some calls; all arrays have an element per call, in seconds."""
 
-    radius: float
-    kernels: tuple[Kernel, ...]
-    call: Spread
-    between: float
-    """Median seconds of a call in which no kernel ran: Python, autograd, launches."""
+    launches: Counter[str]
+    """Of one call, by kernel, in the order of their first launch."""
+    seconds: dict[str, NDArray[np.float64]]
+    """By kernel, all launches of a call together."""
+    calls: NDArray[np.float64]
+    """From begin to end."""
     others_cores: float | None
     """That other processes kept busy meanwhile."""
 
+    @property
+    def kernels(self) -> NDArray[np.float64]:
+        """While a kernel ran."""
+        return np.sum(list(self.seconds.values()), axis=0)
 
-def measure_kernels(scene: Scene) -> Profile:
-    """Profile `CALLS` calls of forward + backward."""
-    task, session = both_passes(scene, Scene.forward), opencl.current()
-    task()
-    walls, calls = [], []
+    @property
+    def around(self) -> NDArray[np.float64]:
+        """While no kernel ran: Python, autograd, launches."""
+        return self.calls - self.kernels
+
+
+def profile(task: Task, calls: int = CALLS, before: Callable[[], object] = lambda: None) -> Profile:
+    """Call ``task`` on the current device with profiling; kernels of what runs ``before`` each call are listed, too."""
+    session, runs, walls = opencl.current(), [], []
     with watching_others() as others:
-        for _ in range(CALLS):
+        for _ in range(calls):
             with session.profile() as times:
+                before()
                 start = time.perf_counter()
                 task()
                 walls.append(time.perf_counter() - start)
-            calls.append(times)
-    launches = Counter(kernel.name for kernel in calls[0])
+            runs.append(times)
+    launches = Counter(kernel.name for kernel in runs[0])
     seconds = {
-        name: np.array([sum(k.end_ns - k.start_ns for k in times if k.name == name) / 1e9 for times in calls])
+        name: np.array([sum(one.end_ns - one.start_ns for one in times if one.name == name) / 1e9 for times in runs])
         for name in launches
     }
-    moved = bytes_of(scene, facts_of(scene))
-    kernels = tuple(_kernel(name, count, seconds[name], moved.get(name)) for name, count in launches.items())
-    idle = [wall - sum(k.end_ns - k.start_ns for k in times) / 1e9 for wall, times in zip(walls, calls, strict=True)]
-    return Profile(float(scene.radii.max()), kernels, Spread.of(np.array(walls)), statistics.median(idle), others.cores)
+    return Profile(launches, seconds, np.array(walls), others.cores)
 
 
-def _kernel(name: str, launches: int, seconds: np.ndarray, moved: int | None) -> Kernel:
-    spread = Spread.of(seconds)
-    if moved is None:
-        return Kernel(name, launches, spread, None, None)
-    return Kernel(name, launches, spread, moved / 1e6, moved / 1e9 / spread.median)
+def facts_of(scene: Scene) -> Facts:
+    """Count what there is in ``scene``."""
+    cloud = (scene.points_uv[0], scene.z[0], scene.radii[0], scene.opacities[0])
+    fragments = list_fragments((scene.height, scene.width), *cloud)
+    return Facts(
+        height=scene.height,
+        width=scene.width,
+        channels=scene.features.shape[-1],
+        radius=float(scene.radii.max()),
+        points=scene.z.numel(),
+        shown_points=len(fragments.order),
+        fragments=len(fragments.points),
+        most_layers=int(fragments.starts.diff().max()),
+    )
 
 
 def bytes_of(scene: Scene, facts: Facts) -> dict[str, int]:

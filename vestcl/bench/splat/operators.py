@@ -1,11 +1,10 @@
-"""`vestcl bench operators`: each operator beside its torch twin and a copy of the same bytes, forward and backward."""
+"""`vestcl bench operators`: each operator beside its reference in torch and a copy of its bytes, both passes."""
 
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -15,13 +14,15 @@ from vestcl import opencl, reference
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
-from vestcl.bench.common.results import X_COPY, Measure, Results
+from vestcl.bench.common.options import Options
+from vestcl.bench.common.results import X_COPY
+from vestcl.bench.common.table import Measurement, Section, busy
 from vestcl.bench.common.timing import Spread, Task
-from vestcl.bench.splat import report as _report
-from vestcl.bench.splat.bench import CHANNELS
-from vestcl.bench.splat.scenes import AHEAD
+from vestcl.bench.splat import roofline
+from vestcl.bench.splat.kernels import profile
+from vestcl.bench.splat.measure import Record
+from vestcl.bench.splat.scenes import AHEAD, CHANNELS, street
 from vestcl.data import Street, intrinsics
-from vestcl.evaluation.tables import Grid
 from vestcl.opencl import trace
 from vestcl.ops.displace import displace
 from vestcl.ops.rigid_flow import rigid_flow
@@ -30,9 +31,6 @@ from vestcl.ops.unproject import unproject
 
 Tensors = tuple[torch.Tensor, ...]
 
-#: Profiled calls: medians of that many have settled.
-CALLS: Final = 15
-
 PASSES: Final = ("forward", "forward + backward")
 
 #: Rotation of the camera from frame to frame, (w, x, y, z): two degrees to the right, as in a bend.
@@ -40,7 +38,7 @@ _TURN: Final = (0.99985, 0.0, 0.01745, 0.0)
 
 
 @dataclass(frozen=True)
-class OperatorsBench:
+class OperatorsBench(Options):
     """Time unproject, rigid_flow, displace and splat in float32 on a street, one point a pixel."""
 
     height: int = 256
@@ -55,18 +53,8 @@ class OperatorsBench:
     """Of the street, opacities and features."""
     seconds: float = 5.0
     """About how long each operator is measured."""
-    threads: int = 2
-    """Of torch, for the copies and the twins."""
-    device: str | None = None
-    """OpenCL device: an index of `vestcl devices`, a part of its name, or "all": every one that works."""
-    json: Path | None = None
-    """File for the results."""
-    markdown: Path | None = None
-    """File for the tables."""
-    plots: Path | None = None
-    """Folder for plots (PNG)."""
-    trace: Path | None = None
-    """File for a trace of calls and kernels, which ui.perfetto.dev opens; it makes times a bit longer."""
+    roofline: bool = False
+    """Also each splat kernel beside the roofs of its device: memory bandwidth and arithmetic."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,30 +84,6 @@ class Operator:
         return torch.autograd.grad(outputs, [recording[index] for index in self.differentiated], grads)
 
 
-class Timed(NamedTuple):
-    """One pass of one operator."""
-
-    operator: str
-    what: str
-    """Of `PASSES`."""
-    time: Spread
-    x_copy: Spread
-    twin: Spread
-    x_twin: Spread
-    """The twin's time as a multiple."""
-    copy: Spread
-    copied_by: str
-    kernels: Spread
-    """Seconds that kernels ran, of profiled calls."""
-    around: Spread
-    """Seconds of these calls in which no kernel ran."""
-    moved_bytes: int
-    """Read and written, every array once."""
-    error: float
-    """Largest of the results' distances to the twin's, relative, in the Euclidean norm."""
-    others_cores: float | None
-
-
 def main(config: OperatorsBench) -> None:
     """Measure, print and write.
 
@@ -128,11 +92,7 @@ def main(config: OperatorsBench) -> None:
         DeviceError: no such device.
     """
     _results.check_positive(config, "height", "width", "channels", "radius", "seconds", "threads")
-    console = _results.console()
-    with trace.record(config.trace), _timing.torch_threads(config.threads):
-        results = _results.measure_each(config.device, partial(_measure_device, config, console), console)
-    _results.save(results, config.json, config.markdown)
-    _results.tell_written(console, config.json, config.markdown, config.trace, config.plots)
+    _results.run("operators", config, partial(_sections, config))
 
 
 def operators(config: OperatorsBench) -> Iterator[Operator]:
@@ -156,8 +116,8 @@ def operators(config: OperatorsBench) -> Iterator[Operator]:
     yield Operator("splat", splat, reference.splat, cloud, (0, 2, 3, 4))
 
 
-def measure(operator: Operator, seconds: float, threads: int) -> list[Timed]:
-    """Time an operator, its twin and copies in turns, then profile its kernels.
+def measure(operator: Operator, seconds: float, threads: int) -> list[Record]:
+    """Time an operator, its reference and copies in turns, then profile its kernels.
 
     Args:
         operator: with its arguments.
@@ -165,7 +125,9 @@ def measure(operator: Operator, seconds: float, threads: int) -> list[Timed]:
         threads: of the copies.
 
     Returns:
-        One of each of `PASSES`.
+        One of each of `PASSES`. "moved_bytes" are read and written, every array once; "kernels" are seconds that
+        kernels ran, of profiled calls, and "around" those in which none did; "error" is the largest of the results'
+        distances to the reference's, relative, in the Euclidean norm.
     """
     outputs = operator.run(operator.ours)
     grads = tuple(torch.randn_like(output) for output in outputs)
@@ -182,10 +144,13 @@ def measure(operator: Operator, seconds: float, threads: int) -> list[Timed]:
     for what in PASSES:
         by = min(copies[what], key=lambda way: float(np.median(times[f"{what}, {way}"])))
         ours, twin, copy = (times[f"{what}, {who}"] for who in ("vestcl", "twin", by))
-        spread, x_copy, of_twin, x_twin, of_copy = map(Spread.of, (ours, ours / copy, twin, twin / ours, copy))
-        error = _error(runs["vestcl"][what](), runs["twin"][what]())
-        inside = *_inside(runs["vestcl"][what]), moved[what], error, others.cores
-        found.append(Timed(operator.name, what, spread, x_copy, of_twin, x_twin, of_copy, by, *inside))
+        inside = profile(runs["vestcl"][what])
+        seconds_of = {"time": ours, "x_copy": ours / copy, "twin": twin, "x_twin": twin / ours, "copy": copy}
+        seconds_of |= {"kernels": inside.kernels, "around": inside.around}
+        about = {"copied_by": by, "moved_bytes": moved[what], "others_cores": others.cores}
+        error = max(map(_distance, runs["vestcl"][what](), runs["twin"][what]()))
+        spreads = {name: Spread.of(values) for name, values in seconds_of.items()}
+        found.append({"operator": operator.name, "what": what, **spreads, **about, "error": error})
     return found
 
 
@@ -211,90 +176,57 @@ def _moved_bytes(operator: Operator, outputs: Tensors) -> dict[str, int]:
     return dict(zip(PASSES, (read + written, (1 + operator.rereads) * read + 2 * written + grads), strict=True))
 
 
-def _inside(task: Task) -> tuple[Spread, Spread]:
-    """Seconds of kernels, and of calls without any kernel running."""
-    kernels, around = [], []
-    for _ in range(CALLS):
-        with opencl.current().profile() as times:
-            start = time.perf_counter()
-            task()
-            wall = time.perf_counter() - start
-        kernels.append(sum(kernel.end_ns - kernel.start_ns for kernel in times) / 1e9)
-        around.append(wall - kernels[-1])
-    return Spread.of(np.array(kernels)), Spread.of(np.array(around))
-
-
-def _error(got: Tensors, true: Tensors) -> float:
-    return max(float((one - other).norm() / other.norm()) for one, other in zip(got, true, strict=True))
+def _distance(got: torch.Tensor, true: torch.Tensor) -> float:
+    return float((got - true).norm() / true.norm())
 
 
 # ---------------------------------------------------------------- one device's results
 
 
-def _measure_device(config: OperatorsBench, console: Console, session: opencl.Session) -> Results:
-    machine = _results.describe(session)
-    _results.show_machine(machine, console)
+def _sections(config: OperatorsBench, session: opencl.Session, console: Console) -> Iterator[Section]:
     torch.manual_seed(config.seed)
-    timed: list[Timed] = []
+    timed: list[Record] = []
     for operator in operators(config):
         with console.status(operator.name), trace.stage(operator.name):
             timed += measure(operator, config.seconds, config.threads)
-    grid = _grid(config, timed)
-    console.print(_report.screen(grid))
+    size = f"{config.height}x{config.width}, C = {config.channels}, radius {config.radius:g} px, float32"
+    notes = (
+        "x copy: over a copy of the same bytes. kernels, around: of profiled calls. twin: vestcl.reference.",
+        *busy(*(one["others_cores"] for one in timed)),
+    )
+    rows = [row for one in timed for row in _rows(one)]
+    yield Section(f"Operators, {size}", rows, notes, {"operators": timed})
     if config.plots is not None:
         _plot(config.plots, session.info, timed)
-    details = {"operators": [_results.plain(one._asdict()) for one in timed]}
-    measures = [measure for one in timed for measure in _measures(one)]
-    return Results("operators", machine, _results.settings(config), measures, [grid], details)
+    if config.roofline:
+        scene = street(config.height, config.width, config.channels, config.radius, config.seed)
+        yield roofline.section(roofline.roofline(scene), config.plots)
 
 
-def _measures(one: Timed) -> Iterator[Measure]:
-    name = f"{one.operator} {one.what}"
-    yield Measure.of(name, "s", one.time)
-    yield Measure.of(name + X_COPY, "1", one.x_copy)
-    yield Measure.of(f"{name}, kernels", "s", one.kernels)
-    yield Measure.of(f"{name}, around kernels", "s", one.around)
-    yield Measure.of(f"{name}, twin / vestcl", "1", one.x_twin, "higher")
+def _rows(one: Record) -> Iterator[Measurement]:
+    name = f"{one['operator']} {one['what']}"
+    yield Measurement(name, "ms (quartiles)", one["time"], "s", name=name)
+    yield Measurement(name, "runs", str(one["time"].runs))
+    yield Measurement(name, "MB", one["moved_bytes"], "B", ".1f")
+    yield Measurement(name, "GB/s", f"{one['moved_bytes'] / 1e9 / one['time'].median:.1f}")
+    yield Measurement(name, "x copy", one["x_copy"], digits=".1f", name=name + X_COPY)
+    yield Measurement(name, "kernels ms", one["kernels"], "s", ".2f", f"{name}, kernels")
+    yield Measurement(name, "around ms", one["around"], "s", ".2f", f"{name}, around kernels")
+    yield Measurement(name, "twin ms", one["twin"], "s", ".2f")
+    yield Measurement(name, "x twin", one["x_twin"], "1", ".1f", f"{name}, twin / vestcl", "higher")
+    yield Measurement(name, "error", one["error"], digits=".0e")
 
 
-def _grid(config: OperatorsBench, timed: list[Timed]) -> Grid:
-    heading = (
-        "",
-        "ms (quartiles)",
-        "runs",
-        "MB",
-        "GB/s",
-        "x copy",
-        "kernels ms",
-        "around ms",
-        "twin ms",
-        "x twin",
-        "error",
-    )
-    rows = []
-    for one in timed:
-        moved = f"{one.moved_bytes / 1e6:.1f}", f"{one.moved_bytes / 1e9 / one.time.median:.1f}"
-        measured = _report.milliseconds(one.time), str(one.time.runs), *moved, f"{one.x_copy.median:.1f}"
-        inside = (f"{spread.median * 1e3:.2f}" for spread in (one.kernels, one.around, one.twin))
-        rows.append((f"{one.operator} {one.what}", *measured, *inside, f"{one.x_twin.median:.1f}", f"{one.error:.0e}"))
-    notes = (
-        "x copy: over a copy of the same bytes. kernels, around them: of profiled calls. twin: vestcl.reference.",
-        *_report.busy(*(one.others_cores for one in timed)),
-    )
-    size = f"{config.height}x{config.width}, C = {config.channels}, radius {config.radius:g} px, float32"
-    return Grid(f"Operators, {size}", heading, tuple(rows), notes)
-
-
-def _plot(folder: Path, info: opencl.DeviceInfo, timed: list[Timed]) -> None:
-    """Times beside twin and copy, and where the time goes."""
-
-    def group(field: str) -> Mapping[str, Spread]:
-        return {f"{one.operator}\n{one.what}": getattr(one, field) for one in timed}
-
+def _plot(folder: Path, info: opencl.DeviceInfo, timed: list[Record]) -> None:
+    """Times beside reference and copy, and where the time goes."""
     device = f"{info.platform} / {info.name}"
-    beside = {"vestcl": group("time"), "torch twin": group("twin"), "copy of the bytes": group("copy")}
-    path = folder / _plots.file_name(f"operators {info.index}")
-    _plots.bars(path, f"Operators\n{device}", "ms", beside, 1e3, log=True)
-    inside = {"kernels": group("kernels"), "around them": group("around")}
-    path = folder / _plots.file_name(f"operators inside {info.index}")
-    _plots.bars(path, f"Kernels and the time around them\n{device}", "ms", inside, 1e3, log=True)
+    charts = {
+        "Operators": {"time": "vestcl", "twin": "torch reference", "copy": "copy of the bytes"},
+        "Operators inside": {"kernels": "kernels", "around": "around kernels"},
+    }
+    for title, fields in charts.items():
+        groups = {
+            label: {f"{one['operator']}\n{one['what']}": one[field] for one in timed} for field, label in fields.items()
+        }
+        path = folder / _plots.file_name(f"{title} {info.index}")
+        _plots.bars(path, f"{title}\n{device}", "ms", groups, log=True)

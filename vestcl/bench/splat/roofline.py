@@ -1,135 +1,66 @@
-"""Each splat kernel beside the roofs of its device: `python -m vestcl.bench.splat.roofline --plots DIR`."""
+"""Each splat kernel beside the roofs of its device: `vestcl bench operators --roofline`.
 
+A kernel that moves b bytes and computes f flops takes at least max(b / bandwidth, f / peak). Both roofs are measured in
+turns with the kernels: a copy past the cache, and chains of multiply-adds, both in OpenCL
+(kernels/splat/splat_roofline.cl). `python -m vestcl.bench.splat.roofline` measures several radii.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import tyro
+from rich.console import Console
 
 from vestcl import opencl
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
-from vestcl.bench.common.results import Measure, Results
-from vestcl.bench.splat import report as _report
-from vestcl.bench.splat.roofs import Roofline, roofline
-from vestcl.bench.splat.scenes import street
-from vestcl.evaluation.tables import Grid
+from vestcl.bench.common.options import Options
+from vestcl.bench.common.table import Measurement, Section, busy
+from vestcl.bench.common.timing import Spread
+from vestcl.bench.splat.kernels import bytes_of, facts_of, flops_of, profile
+from vestcl.bench.splat.measure import Record, both_passes
+from vestcl.bench.splat.scenes import CHANNELS, Scene, street
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+_FILE: Final = "splat/splat_roofline.cl"
 
-#: Inches of the plot, two panels side by side: its height and width.
-_SIZE: Final = (4.5, 11.0)
+#: Of kernels/splat/splat_roofline.cl: bytes that a work-group copies, and flops of a work-item's round.
+_BLOCK_BYTES: Final = 1024 * 16 * 4
+_ROUND_FLOPS: Final = 10 * 16 * 2
 
-#: Columns of the tables where they don't go to a terminal, whose own number counts there.
-_WIDTH: Final = 160
+#: Bytes that the copy reads, and as many that it writes: beyond the caches of most processors.
+COPY_BYTES: Final = 1 << 26
+
+#: Rounds of multiply-adds: a millisecond or so. A GPU has thousands of work-items that share them.
+ROUNDS: Final = {"tile": 1 << 16, "pixel": 1 << 11}
+
+#: Work-items of a group, and groups for each compute unit: a CPU's kernels run one a group.
+_LOCAL: Final = {"tile": 1, "pixel": 256}
+_GROUPS: Final = {"tile": 4, "pixel": 8}
+
+#: Profiled calls of forward + backward.
+CALLS: Final = 30
 
 
 @dataclass(frozen=True)
-class RooflineBench:
+class RooflineBench(Options):
     """How near each splat kernel comes to what its device can do."""
 
     height: int = 256
     """Pixels."""
     width: int = 832
     """Pixels."""
-    channels: int = 32
+    channels: int = CHANNELS
     """Of the features."""
     radii: tuple[float, ...] = (1.0, 2.0)
     """Pixels; each is a scene of its own."""
-    calls: int = 30
+    calls: int = CALLS
     """Profiled calls of forward + backward."""
     seed: int = 0
     """Of the street, opacities and features."""
-    device: str | None = None
-    """OpenCL device: an index of `vestcl devices` or a part of its name; "all": every one that works."""
-    json: Path | None = None
-    """File for the results."""
-    markdown: Path | None = None
-    """File for the tables."""
-    plots: Path | None = None
-    """Folder for plots (PNG)."""
-
-
-def title_of(result: Roofline) -> str:
-    """Which scene."""
-    facts = result.facts
-    return f"Roofline, {facts.height}x{facts.width}, C = {facts.channels}, radius {facts.radius:g} px"
-
-
-def grid(result: Roofline) -> Grid:
-    """A row a kernel, the roofs below."""
-    rows = []
-    for point in result.points:
-        speeds = point.moved_bytes / point.time.median / 1e9, point.flops / point.time.median / 1e9
-        work = f"{point.moved_bytes / 1e6:.1f}", f"{point.flops / 1e6:.1f}", f"{point.flops / point.moved_bytes:.2f}"
-        share = f"{point.share.median:.0%} ({point.share.low:.0%}-{point.share.high:.0%})"
-        cells = f"{point.time.median * 1e3:.3f}", *work, f"{speeds[0]:.1f}", f"{speeds[1]:.1f}", point.bound, share
-        rows.append((point.name, str(point.launches), *cells))
-    least = sum(point.share.median * point.time.median for point in result.points)
-    blank = ("",) * 6
-    rows.append(("all kernels", "", f"{result.kernels * 1e3:.3f}", *blank, f"{least / result.kernels:.0%}"))
-    rows.append(("no kernel running", "", f"{result.between * 1e3:.3f}", *blank, ""))
-    roofs = f"roofs: {result.bandwidth.median / 1e9:.1f} GB/s copied, {result.peak.median / 1e9:.0f} Gflop/s"
-    heading = "", "launches", "ms", "MB", "Mflop", "flop/byte", "GB/s", "Gflop/s", "bound by", "of the roof"
-    return Grid(title_of(result), heading, tuple(rows), (roofs, *_report.busy(result.others_cores)))
-
-
-def measures(result: Roofline) -> list[Measure]:
-    """The roofs, and each kernel's share."""
-    radius = f", radius {result.facts.radius:g}"
-    shares = [Measure.of(f"roofline {point.name}{radius}", "1", point.share, "higher") for point in result.points]
-    roofs = [("bandwidth", "B/s", result.bandwidth), ("peak", "flop/s", result.peak)]
-    return [*(Measure.of(f"roofline {name}{radius}", unit, roof, "higher") for name, unit, roof in roofs), *shares]
-
-
-def plot(path: Path, result: Roofline) -> Path:
-    """Draw the roofs and the kernels that compute, on logarithmic axes; beside them every kernel's share as a bar.
-
-    Args:
-        path: of the PNG; it is replaced whole.
-        result: from `roofline`.
-
-    Returns:
-        ``path``.
-
-    Raises:
-        ValueError: the folder can't be made.
-    """
-    figure = _plots.blank(*_SIZE)
-    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    _draw_roofs(left, result)
-    shares = [point.share for point in result.points]
-    around = [[s.median - s.low for s in shares], [s.high - s.median for s in shares]]
-    right.barh([point.name for point in result.points], [s.median for s in shares], xerr=around, color="C0")
-    right.axvline(1, color="black", linewidth=1)
-    right.invert_yaxis()
-    right.set(xlabel="share of the roof", xlim=(0, max(1.05, *(s.high for s in shares))))
-    right.grid(axis="x", alpha=0.3, linewidth=0.5)
-    figure.suptitle(title_of(result), fontsize=_plots.TITLE)
-    return _plots.write(figure, path)
-
-
-def _draw_roofs(axes: "Axes", result: Roofline) -> None:
-    ridge = result.peak.median / result.bandwidth.median
-    computing = [point for point in result.points if point.flops]
-    places = [point.flops / point.moved_bytes for point in computing]
-    x = np.geomspace(min([*places, ridge]) / 4, max([*places, ridge]) * 4, 200)
-    roof = np.minimum(x * result.bandwidth.median, result.peak.median) / 1e9
-    roofs = f"{result.bandwidth.median / 1e9:.0f} GB/s, {result.peak.median / 1e9:.0f} Gflop/s"
-    axes.plot(x, roof, color="black", label=roofs)
-    for number, (point, place) in enumerate(zip(computing, places, strict=True)):
-        reached = point.flops / point.time.median / 1e9
-        axes.plot(place, reached, "o", color=f"C{number}", label=f"{point.name}, {point.share.median:.0%}")
-        axes.plot([place, place], [reached, reached / point.share.median], ":", color=f"C{number}")
-    axes.set(xscale="log", yscale="log", xlabel="flops for each byte that must move", ylabel="Gflop/s")
-    axes.grid(alpha=0.3, which="both", linewidth=0.5)
-    axes.legend(fontsize=8)
-
-
-# ---------------------------------------------------------------- command
 
 
 def main(config: RooflineBench) -> None:
@@ -142,24 +73,141 @@ def main(config: RooflineBench) -> None:
     _results.check_positive(config, "height", "width", "channels", "calls")
     if not config.radii or min(config.radii) <= 0:
         raise ValueError(f"`radii` must be one or more positive numbers, got {config.radii}")
-    console = _results.console(_WIDTH)
-    results = _results.measure_each(config.device, partial(_measure_device, config), console)
-    _results.show(results, console)
-    _results.save(results, config.json, config.markdown)
-    _results.tell_written(console, config.json, config.markdown, config.plots)
+    _results.run("roofline", config, partial(_sections, config))
 
 
-def _measure_device(config: RooflineBench, session: opencl.Session) -> Results:
-    found = []
+def _sections(config: RooflineBench, session: opencl.Session, _: Console) -> Iterator[Section]:
     for radius in config.radii:
         scene = street(config.height, config.width, config.channels, radius, config.seed)
-        found.append(roofline(scene, config.calls))
-        if config.plots is not None:
-            plot(config.plots / _plots.file_name(f"{session.info.name} {title_of(found[-1])}"), found[-1])
-    details: dict[str, Any] = {"rooflines": _results.plain(found)}
-    figures = [measure for result in found for measure in measures(result)]
-    grids = [grid(result) for result in found]
-    return Results("roofline", _results.describe(session), _results.settings(config), figures, grids, details)
+        yield section(roofline(scene, config.calls), config.plots)
+
+
+def roofline(scene: Scene, calls: int = CALLS, copy_bytes: int = COPY_BYTES) -> Record:
+    """Profile forward + backward in turns with the roofs, on the current device.
+
+        share = max(bytes / bandwidth, flops / peak) / time
+
+    Args:
+        scene: what is splatted, float32.
+        calls: rounds of copy, multiply-adds and forward + backward.
+        copy_bytes: that the copy reads, and as many that it writes.
+
+    Returns:
+        "facts"; the roofs "bandwidth" (bytes a second, read and written) and "peak" (flops a second); "points", those
+        kernels whose work is counted, with their share of the lower roof's median; seconds of a call ("call"), and
+        their medians while kernels ran ("kernels") and none did ("between").
+
+    Raises:
+        ValueError: ``calls`` or ``copy_bytes`` not positive.
+
+    Source: Williams, Waterman, Patterson: Roofline (2009).
+    """
+    if calls < 1 or copy_bytes < 1:
+        raise ValueError(f"`calls` and `copy_bytes` must be positive, got {calls} and {copy_bytes}")
+    task, roofs = both_passes(scene), _Roofs(copy_bytes)
+    task()
+    found = profile(task, calls, roofs.run)
+    bandwidth = Spread.of(roofs.moved_bytes / found.seconds.pop("copy_numbers"))
+    peak = Spread.of(roofs.flops / found.seconds.pop("multiply_add"))
+    facts = facts_of(scene)
+    moved, flops, points = bytes_of(scene, facts), flops_of(facts), list[Record]()
+    for name in found.seconds.keys() & moved.keys():
+        by_memory, by_compute = moved[name] / bandwidth.median, flops.get(name, 0) / peak.median
+        points.append({
+            "name": name,
+            "launches": found.launches[name],
+            "time": Spread.of(found.seconds[name]),
+            "moved_bytes": moved[name],
+            "flops": flops.get(name, 0),
+            "share": Spread.of(max(by_memory, by_compute) / found.seconds[name]),
+            "bound": "memory" if by_memory >= by_compute else "compute",
+        })  # fmt: skip
+    points.sort(key=lambda point: list(found.seconds).index(point["name"]))
+    seconds = {"kernels": float(np.median(found.kernels)), "between": float(np.median(found.around))}
+    result = {"facts": facts, "bandwidth": bandwidth, "peak": peak, "points": points, "call": Spread.of(found.calls)}
+    return result | seconds | {"others_cores": found.others_cores}
+
+
+class _Roofs:
+    """What measures the roofs: launches of kernels/splat/splat_roofline.cl on memory that has been written before."""
+
+    def __init__(self, copy_bytes: int) -> None:
+        self._session = opencl.current()
+        mapping = self._session.mapping
+        self._local, self._rounds = _LOCAL[mapping], ROUNDS[mapping]
+        self._blocks = -(-copy_bytes // _BLOCK_BYTES)
+        self._items = _GROUPS[mapping] * self._local * self._session.info.compute_units
+        self.moved_bytes = 2 * self._blocks * _BLOCK_BYTES
+        self.flops = self._items * self._rounds * _ROUND_FLOPS
+        with self._session.job() as job:
+            self._from, self._to = (job.scratch(self._blocks * _BLOCK_BYTES, np.uint8) for _ in range(2))
+            self._sums = job.scratch(self._items, np.float32)
+        self.run()
+        self._from, self._to = self._to, self._from  # memory never written would be one page of zeros, in the cache
+        self.run()
+
+    def run(self) -> None:
+        """Copy, and multiply and add."""
+        defines = {"BUILTINS": int(self._session.compiles_builtins)}
+        numbers = [np.int32(self._rounds), np.float32(0.5), np.float32(1)]
+        with self._session.job() as job:
+            size = (self._blocks * self._local,)
+            job.launch(_FILE, "copy_numbers", defines, size, [self._from, self._to], (self._local,))
+            job.launch(_FILE, "multiply_add", defines, (self._items,), [*numbers, self._sums], (self._local,))
+
+
+def section(result: Record, plots: Path | None) -> Section:
+    """A row a kernel, the roofs below; with a plot in the folder ``plots``."""
+    title, roofs = f"Roofline, {result['facts'].size} px", (result["bandwidth"].median, result["peak"].median)
+    if plots is not None:
+        plot(plots / _plots.file_name(f"{opencl.current().info.name} {title}"), title, result)
+    notes = f"roofs: {roofs[0] / 1e9:.1f} GB/s copied, {roofs[1] / 1e9:.0f} Gflop/s", *busy(result["others_cores"])
+    return Section(title, list(_rows(result)), notes, {"rooflines": [result]})
+
+
+def _rows(result: Record) -> Iterator[Measurement]:
+    radius = f", radius {result['facts'].radius:g}"
+    for name, unit in (("bandwidth", "B/s"), ("peak", "flop/s")):
+        yield Measurement(name, "", result[name], unit, name=f"roofline {name}{radius}", better="higher")
+    for point in result["points"]:
+        row, share, seconds = point["name"], point["share"], point["time"].median
+        moved, flops = point["moved_bytes"], point["flops"]
+        cells = {"launches": f"{point['launches']}", "ms": f"{seconds * 1e3:.3f}", "MB": f"{moved / 1e6:.1f}"}
+        cells |= {"Mflop": f"{flops / 1e6:.1f}", "flop/byte": f"{flops / moved:.2f}"}
+        cells |= {"GB/s": f"{moved / seconds / 1e9:.1f}", "Gflop/s": f"{flops / seconds / 1e9:.1f}"}
+        cells |= {"bound by": point["bound"]}
+        for column, text in cells.items():
+            yield Measurement(row, column, text)
+        yield Measurement(row, "of the roof", f"{share.median:.0%} ({share.low:.0%}-{share.high:.0%})")
+        yield Measurement(row, "", share, name=f"roofline {row}{radius}", better="higher")
+    least = sum(point["share"].median * point["time"].median for point in result["points"])
+    for row, key in (("all kernels", "kernels"), ("no kernel running", "between")):
+        yield Measurement(row, "ms", result[key], "s", ".3f")
+    yield Measurement("all kernels", "of the roof", least / result["kernels"], digits=".0%")
+
+
+def plot(path: Path, title: str, result: Record) -> Path:
+    """Draw the roofs, and below them the kernels that compute, on logarithmic axes.
+
+    Raises:
+        ValueError: the folder can't be made.
+    """
+    figure = _plots.blank(4.5)
+    axes: Any = figure.subplots()
+    bandwidth, peak = result["bandwidth"].median, result["peak"].median
+    computing = [point for point in result["points"] if point["flops"]]
+    places = [point["flops"] / point["moved_bytes"] for point in computing]
+    x = np.geomspace(min([*places, peak / bandwidth]) / 4, max([*places, peak / bandwidth]) * 4, 200)
+    axes.plot(x, np.minimum(x * bandwidth, peak) / 1e9, color="black", label=f"{bandwidth / 1e9:.0f} GB/s copied")
+    for point, place in zip(computing, places, strict=True):
+        reached, share = point["flops"] / point["time"].median / 1e9, point["share"].median
+        (drawn,) = axes.plot(place, reached, "o", label=f"{point['name']}, {share:.0%}")
+        axes.plot([place, place], [reached, reached / share], ":", color=drawn.get_color())
+    labels = {"xlabel": "flops for each byte that must move", "ylabel": "Gflop/s"}
+    axes.set(xscale="log", yscale="log", title=title, **labels)
+    axes.grid(alpha=0.3, which="both", linewidth=0.5)
+    axes.legend(fontsize=8)
+    return _plots.write(figure, path)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,9 @@ from vestcl.ops.displace import displace
 from vestcl.ops.splat import splat
 from vestcl.ops.unproject import unproject
 
+#: Channels of the features: what the encoder gives (SPEC section 3).
+CHANNELS: Final = 32
+
 #: How far the camera has moved ahead, metres: what a car drives in a tenth of a second at 29 km/h.
 AHEAD: Final = 0.8
 
