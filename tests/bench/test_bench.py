@@ -52,7 +52,7 @@ def test_a_run_writes_and_prints_everything(
 ) -> None:
     monkeypatch.setattr(splat, "SIZES", ((8, 16), (16, 32)))
     monkeypatch.setattr(splat, "CHANNEL_SWEEP", (1, 3))
-    monkeypatch.setattr(splat._pytorch3d, "is_installed", lambda: False)
+    monkeypatch.setattr(splat.pytorch3d, "is_installed", lambda: False)
     monkeypatch.setenv("COLUMNS", "200")
     path = tmp_path / "new folder" / "splat.json"
     splat.main(splat.SplatBench(**TINY, scaling=True, channels=True, json=path))

@@ -133,10 +133,40 @@ def test_a_measure_of_a_spread() -> None:
     assert Measure.of("a", "s", Spread(2.0, 1.0, 3.0, 7)) == Measure("a", "s", 2.0, 1.0, 3.0, "lower")
 
 
-def test_the_screen_shows_machine_and_tables(console: Console) -> None:
-    _results.show([results(), results(device="1:0 other")], console)
+def test_sections_become_figures_tables_and_details(console: Console) -> None:
+    rows = [
+        _table.Measurement("moved", "ms", Spread(2e-3, 1e-3, 3e-3, 5), "s", name="beads moved"),
+        _table.Measurement("moved", "verdict", "<= 4 reached"),
+        _table.Measurement("kept", "ms", math.nan, "s", ".1f"),
+        _table.Measurement("kept", "", 0.5, name="beads kept", better="higher"),
+    ]
+    sections = [_table.Section("Beads", rows, ("a note",), {"beads": [1]}), _table.Section("", [], (), {"beads": [2]})]
+    found = _results.collect("abacus", {"device": "0:0"}, {}, sections, console)
+    assert found.measures == [
+        Measure("beads moved", "s", 2e-3, 1e-3, 3e-3),
+        Measure("beads kept", "1", 0.5, 0.5, 0.5, "higher"),
+    ]
+    assert found.details == {"beads": [1, 2]}
+    (grid,) = found.grids
+    assert grid.heading == ("", "ms", "verdict") and grid.notes == ("a note",)
+    assert grid.rows == (("moved", "2.00 (1.00-3.00)", "<= 4 reached"), ("kept", "-", ""))
     text = console.export_text()
-    assert "device: 0:0 frame" in text and "device: 1:0 other" in text and text.count("Beads") == 2
+    assert "Beads" in text and "2.00 (1.00-3.00)" in text and "a note" in text
+
+
+@pytest.mark.parametrize("width", [40, 80, 300])
+def test_a_table_that_is_too_wide_goes_on_below(width: int) -> None:
+    columns = [f"column {number}" for number in range(12)]
+    rows = [_table.Measurement(row, name, f"{row}{name}") for row in ("a", "b") for name in columns]
+    grid = _table.Section("Wide", rows).grid()
+    parts = list(_table.fitting(grid, width))
+    assert [name for part in parts for name in part.heading[1:]] == columns
+    assert all(part.heading[0] == "" and [row[0] for row in part.rows] == ["a", "b"] for part in parts)
+    assert len(parts) == {40: 5, 80: 2, 300: 1}[width]
+    console = Console(width=width, record=True, file=io.StringIO())
+    _table.show_grid(grid, console)
+    text = console.export_text()
+    assert all(f"{row}{name}" in text for row in "ab" for name in columns), "no cell is cut"
 
 
 # ---------------------------------------------------------------- devices
@@ -144,7 +174,13 @@ def test_the_screen_shows_machine_and_tables(console: Console) -> None:
 
 def test_one_device_is_current_while_it_is_measured(session: opencl.Session) -> None:
     before = opencl.current()
-    seen = [(one, opencl.current()) for one in _results.each_device(session.info.index)]
+    seen = []
+
+    def measure(one: opencl.Session) -> Results:
+        seen.append((one, opencl.current()))
+        return results()
+
+    _results.measure_each(session.info.index, measure, Console())
     assert [one.info.index for one, _ in seen] == [session.info.index] and seen[0][0] is seen[0][1]
     assert opencl.current() is before
     machine = _results.describe(session)
@@ -154,14 +190,20 @@ def test_one_device_is_current_while_it_is_measured(session: opencl.Session) -> 
 
 def test_all_devices_are_those_that_the_doctor_passes(monkeypatch: pytest.MonkeyPatch, console: Console) -> None:
     infos = doctored(monkeypatch, True, False, True)
-    assert [one.info for one in _results.each_device("all", console)] == [infos[0], infos[2]]
+    seen = []
+
+    def measure(one: opencl.Session) -> Results:
+        seen.append(one.info)
+        return results()
+
+    assert len(_results.measure_each("all", measure, console)) == 2 and seen == [infos[0], infos[2]]
     assert f"{infos[1].index} {infos[1].platform} / {infos[1].name} left out: build: ill" in _flat(console)
 
 
 def test_no_device_works(monkeypatch: pytest.MonkeyPatch, console: Console) -> None:
     doctored(monkeypatch, False)
     with pytest.raises(opencl.DeviceError, match="`vestcl doctor` tells why"):
-        list(_results.each_device("all", console))
+        _results.measure_each("all", lambda _: results(), console)
 
 
 def test_a_device_that_fails_is_reported_and_the_others_go_on(
@@ -200,12 +242,15 @@ def _flat(console: Console) -> str:
 SPREADS = [Spread(value, 0.8 * value, 1.3 * value, 5) for value in (1e-4, 3e-3)]
 
 
+CELLS = (("y", "a", SPREADS[1]), ("x", "b", SPREADS[1]), ("y", "b", SPREADS[0]))
+
+
 def test_plots_are_pictures(tmp_path: Path) -> None:
     lines = [_plots.Curve("a", [64, 256], SPREADS, 1e3), _plots.Curve("b", [64, 256], SPREADS[::-1], dashed=True)]
     curves = _plots.curves(tmp_path / "new" / "curves.png", "title", "points", "ms", lines)
-    groups = {"a": {"x": SPREADS[0], "y": SPREADS[1]}, "b": {"y": SPREADS[0]}}
-    kinds = [{}, {"log": True}, {"stacked": True}]
-    bars = [_plots.bars(tmp_path / f"{number}.png", "title", "ms", groups, **kind) for number, kind in enumerate(kinds)]
+    rows = [_table.Measurement(row, column, one, "s") for row, column, one in (("x", "a", SPREADS[0]), *CELLS)]
+    frame = _table.long_table(rows)
+    bars = [_plots.bars(tmp_path / f"{stacked}.png", "title", frame, stacked) for stacked in (False, True)]
     for path in (curves, *bars):
         picture = np.asarray(Image.open(path).convert("L"))
         assert picture.shape[1] == 1200 and picture.shape[0] >= 300
@@ -216,8 +261,8 @@ def test_plots_are_pictures(tmp_path: Path) -> None:
 def test_plots_of_nothing_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="`lines` must be one or more"):
         _plots.curves(tmp_path / "a.png", "", "", "", [])
-    with pytest.raises(ValueError, match="`groups` must have one or more bars"):
-        _plots.bars(tmp_path / "a.png", "", "", {"a": {}})
+    with pytest.raises(ValueError, match="`frame` must have one or more rows"):
+        _plots.bars(tmp_path / "a.png", "", _table.long_table([]))
     assert not list(tmp_path.iterdir())
 
 

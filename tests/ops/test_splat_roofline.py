@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from vestcl import opencl
+from vestcl.bench.common import results as _results
 from vestcl.bench.splat import roofline as _roofline
 from vestcl.bench.splat.kernels import Facts, bytes_of, facts_of, flops_of
 from vestcl.bench.splat.roofline import RooflineBench, roofline
@@ -74,15 +75,18 @@ def test_flops_grow_with_fragments_and_channels() -> None:
         assert flops_of(facts)[name] < wider[name]
 
 
-def test_table_figures_and_plot(measured: tuple[Scene, dict[str, Any]], tmp_path: Path) -> None:
+def test_table_figures_and_plot(
+    measured: tuple[Scene, dict[str, Any]], mapped_session: opencl.Session, tmp_path: Path
+) -> None:
     from matplotlib.image import imread
 
     _, result = measured
     names = [point["name"] for point in result["points"]]
-    section = _roofline.section(result, tmp_path / "deep")
+    section = _roofline.section(result)
     assert [row[0] for row in section.grid().rows] == [*names, "all kernels", "no kernel running"]
     figures = [row.name for row in section.rows if row.name]
     assert len({*figures}) == len(figures) == 2 + len(names)
+    list(_results.drawn("roofline", mapped_session, tmp_path / "deep", [section]))
     (path,) = (tmp_path / "deep").iterdir()
     picture = imread(path)
     assert picture.shape[0] > 400 < picture.shape[1]

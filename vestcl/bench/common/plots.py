@@ -1,7 +1,7 @@
 """Plots of the benchmarks: medians with their quartiles, as curves and as bars. matplotlib is imported late."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -71,23 +71,14 @@ def curves(path: Path, title: str, x_label: str, y_label: str, lines: Sequence[C
     return _finish(figure, path, title)
 
 
-def bars(
-    path: Path,
-    title: str,
-    x_label: str,
-    groups: Mapping[str, Mapping[str, Spread]],
-    stacked: bool = False,
-    log: bool = False,
-) -> Path:
-    """Draw milliseconds as bars below each other, the first on top, with their medians as numbers.
+def bars(path: Path, title: str, frame: pd.DataFrame, stacked: bool = False) -> Path:
+    """Draw the milliseconds of a long table as bars below each other, medians with their quartiles and numbers.
 
     Args:
         path: of the PNG; it is replaced whole.
         title: above the axes.
-        x_label: with its unit.
-        groups: by the legend's name and the bar's name. Bars of one name are next to each other, with their quartiles.
-        stacked: bars of one name are parts of one, from left to right, which has the number.
-        log: the x axis is logarithmic, for positive numbers that differ by orders of magnitude.
+        frame: of `vestcl.bench.common.table.long_table`, in seconds. A place a row, a colour a column.
+        stacked: instead a place a column, with the rows as its parts from left to right, and the number of all.
 
     Returns:
         ``path``.
@@ -97,26 +88,23 @@ def bars(
     """
     from matplotlib.container import BarContainer
 
-    names = list(dict.fromkeys(name for group in groups.values() for name in group))
-    if not names:
-        raise ValueError("`groups` must have one or more bars, got none")
+    if frame.empty:
+        raise ValueError("`frame` must have one or more rows, got none")
+    place, colour = ("column", "row") if stacked else ("row", "column")
     low, median, high = (
-        pd.DataFrame({
-            label: {name: 1e3 * getattr(spread, part) for name, spread in group.items()}
-            for label, group in groups.items()
-        }).reindex(names)
+        1e3 * frame.pivot(index=place, columns=colour, values=part).loc[frame[place].unique(), frame[colour].unique()]
         for part in ("low", "median", "high")
-    )  # fmt: skip
+    )
     figure = blank(_AROUND + _BAR * max(len(median) if stacked else median.size, 4))
     axes = figure.subplots()
     around = None if stacked else [[median[name] - low[name], high[name] - median[name]] for name in median]
-    median.plot.barh(ax=axes, stacked=stacked, logx=log, xerr=around, width=0.8, legend=False)
+    median.plot.barh(ax=axes, stacked=stacked, logx=not stacked, xerr=around, width=0.8, legend=False)
     drawn = [container for container in axes.containers if isinstance(container, BarContainer)]
     for container in drawn[-1:] if stacked else drawn:
         axes.bar_label(container, fmt="%.3g", fontsize=7, padding=3)
     axes.margins(x=0.18)
     axes.invert_yaxis()
-    axes.set_xlabel(x_label)
+    axes.set(xlabel="ms", ylabel="")
     return _finish(figure, path, title)
 
 

@@ -7,19 +7,20 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import numpy as np
 from rich.console import Console
 from rich.text import Text
 
 from vestcl import __version__, doctor, opencl
+from vestcl.bench.common import plots
 from vestcl.bench.common.options import Options
-from vestcl.bench.common.table import Better, Section, show_grid
+from vestcl.bench.common.table import Better, Section, long_table, show_grid
 from vestcl.bench.common.timing import Spread, torch_threads
 from vestcl.evaluation.tables import Grid, finite, to_markdown
 from vestcl.io import atomic
@@ -117,13 +118,25 @@ def run(bench: str, config: Options, measure: Callable[[opencl.Session, Console]
     def measured(session: opencl.Session) -> Results:
         machine = describe(session)
         show_machine(machine, screen)
-        return collect(bench, machine, settings(config), measure(session, screen), screen)
+        sections = drawn(bench, session, config.plots, measure(session, screen))
+        return collect(bench, machine, settings(config), sections, screen)
 
     with trace.record(config.trace), torch_threads(config.threads):
         results = measure_each(config.device, measured, screen)
     save(results, config.json, config.markdown)
     tell_written(screen, config.json, config.markdown, config.trace, config.plots)
     return results
+
+
+def drawn(bench: str, session: opencl.Session, folder: Path | None, sections: Iterable[Section]) -> Iterator[Section]:
+    """The sections, whose plots are drawn in ``folder``."""
+    for section in sections:
+        frame = long_table(row for row in section.rows if row.column)
+        wanted = [frame[frame["column"].isin(columns)] for columns in section.plots] + [frame] * section.stacked
+        for number, own in enumerate(wanted if folder else (), 1):
+            path = Path(folder or "") / plots.file_name(f"{bench} {section.title} {number} {session.info.index}")
+            plots.bars(path, f"{section.title}\n{device_name(session)}", own, section.stacked)
+        yield section
 
 
 def collect(
@@ -144,30 +157,12 @@ def collect(
 # ---------------------------------------------------------------- devices
 
 
-def each_device(selector: str | None, console: Console | None = None) -> Generator[opencl.Session, None, None]:
-    """Sessions to measure on, one after the other; each is vestcl's current one until the next is asked for.
+def measure_each(selector: str | None, measure: Callable[[opencl.Session], Results], console: Console) -> list[Results]:
+    """``measure`` on one device or on all; of all, those that fail are reported, and the others go on.
 
     Args:
         selector: as in `opencl.select`; or "all": every device that passes `vestcl doctor`, each tried in a process of
             its own first, because a driver may kill the one that loads it.
-        console: where devices that don't work are reported; None is the error output.
-
-    Yields:
-        The session, inside `opencl.use`.
-
-    Raises:
-        DeviceError: no such device, or with "all" none that works.
-    """
-    for index in _usable(console or Console(stderr=True)) if selector == ALL else [selector]:
-        with opencl.use(index) as session:
-            yield session
-
-
-def measure_each(selector: str | None, measure: Callable[[opencl.Session], Results], console: Console) -> list[Results]:
-    """``measure`` on `each_device`. With "all", a device that fails is reported and the others go on.
-
-    Args:
-        selector: as in `each_device`.
         measure: of one device, which is vestcl's current one.
         console: where failures are reported.
 
@@ -177,24 +172,18 @@ def measure_each(selector: str | None, measure: Callable[[opencl.Session], Resul
     Raises:
         DeviceError: no such device, or with "all" none that works.
     """
-    with contextlib.closing(each_device(selector, console)) as sessions:  # an error must not leave a device in use
-        found = [_tried(session, measure, console, selector == ALL) for session in sessions]
-    results = [result for result in found if result is not None]
+    results = []
+    for index in _usable(console) if selector == ALL else [selector]:
+        with opencl.use(index) as session:
+            try:
+                results.append(measure(session))
+            except Exception as error:  # drivers fail in many ways, and runtime alone knows pyopencl's
+                if isinstance(error, ValueError) or selector != ALL:  # a mistake in the settings is no device's
+                    raise
+                _report(console, session.info, f"{type(error).__name__}: {error}")
     if not results:
         raise opencl.DeviceError("the benchmark failed on every device")
     return results
-
-
-def _tried(
-    session: opencl.Session, measure: Callable[[opencl.Session], Results], console: Console, others_go_on: bool
-) -> Results | None:
-    try:
-        return measure(session)
-    except Exception as error:  # drivers fail in many ways, and runtime alone knows pyopencl's
-        if isinstance(error, ValueError) or not others_go_on:  # a mistake in the settings is no device's
-            raise
-        _report(console, session.info, f"{type(error).__name__}: {error}")
-        return None
 
 
 def _usable(console: Console) -> list[str]:
@@ -266,14 +255,6 @@ def _processor() -> str:
 # ---------------------------------------------------------------- screen and files
 
 
-def show(results: Sequence[Results], console: Console) -> None:
-    """Print each device, what the numbers depend on, and its tables."""
-    for result in results:
-        show_machine(result.machine, console)
-        for grid in result.grids:
-            show_grid(grid, console)
-
-
 def show_machine(machine: dict[str, str], console: Console) -> None:
     """Print what the numbers depend on."""
     for name, value in machine.items():
@@ -296,7 +277,9 @@ def save(results: Sequence[Results], json: Path | None, markdown: Path | None) -
     if len(benches) != 1:
         raise ValueError(f"`results` must be of one bench, got {', '.join(sorted(benches)) or 'none'}")
     if json is not None:
-        write_json(json, _to_json(results))
+        kept = ("machine", "config", "measures", "details")
+        devices = [{name: getattr(result, name) for name in kept} for result in results]
+        write_json(json, plain({"vestcl": _FORMAT, "bench": results[0].bench, "devices": devices}))
     if markdown is not None:
         atomic.write_bytes(markdown, "\n".join(map(_to_markdown, results)).encode())
 
@@ -347,11 +330,6 @@ def plain(value: Any) -> Any:
     return finite(value)
 
 
-def _to_json(results: Sequence[Results]) -> dict[str, Any]:
-    devices = [{name: getattr(r, name) for name in ("machine", "config", "measures", "details")} for r in results]
-    return dict(plain({"vestcl": _FORMAT, "bench": results[0].bench, "devices": devices}))
-
-
 def _to_markdown(result: Results) -> str:
     facts = "".join(f"- {name}: {value}\n" for name, value in result.machine.items())
     chosen = ", ".join(f"{name} {value}" for name, value in result.config.items() if value is not None)
@@ -366,9 +344,8 @@ def _device(bench: str, device: dict[str, Any]) -> Results:
 
 
 def _measure(content: dict[str, Any]) -> Measure:
-    median, low, high = (
-        float("nan") if content[key] is None else float(content[key]) for key in ("median", "low", "high")
-    )
-    if content["better"] not in ("lower", "higher"):
+    numbers = (content[key] for key in ("median", "low", "high"))
+    median, low, high = (float("nan") if number is None else float(number) for number in numbers)
+    if content["better"] not in get_args(Better):
         raise TypeError(f'"better": {content["better"]!r}')
     return Measure(content["name"], content["unit"], median, low, high, content["better"])

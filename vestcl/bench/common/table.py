@@ -97,6 +97,10 @@ class Section:
     notes: tuple[str, ...] = ()
     details: dict[str, Any] = field(default_factory=dict)
     """For JSON, see `vestcl.bench.common.results.plain`; lists of several sections under one key become one list."""
+    plots: tuple[tuple[str, ...], ...] = ()
+    """The columns, in seconds, of each plot: `vestcl.bench.common.plots.bars`."""
+    stacked: bool = False
+    """Whether there is a plot of all columns with stacked bars."""
 
     def grid(self) -> Grid:
         """Rows by columns."""

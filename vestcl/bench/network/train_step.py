@@ -1,14 +1,13 @@
 """`vestcl bench train-step`: a training step by stage, what gradients cost that nobody asks for, and torch's splat."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 from rich.console import Console
 
 from vestcl import opencl
-from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.table import Measurement, Section, busy
@@ -68,7 +67,7 @@ def main(config: TrainStepBench) -> None:
 
 
 def _sections(
-    config: TrainStepBench, model_config: ModelConfig, session: opencl.Session, console: Console
+    config: TrainStepBench, model_config: ModelConfig, _: opencl.Session, console: Console
 ) -> Iterator[Section]:
     """Everything on one device: variants, stages, and torch's splat."""
     model = made(Forecaster, model_config, config.seed).train()
@@ -88,16 +87,12 @@ def _sections(
         for way in (FORWARD, BACKWARD)
         for stage, spread in step[way].items()
     ]
-    yield Section("stages, ms", rows, (note,))
+    yield Section("stages, ms", rows, (note,), stacked=True)
     if config.twin:
         with console.status("a step with torch's splat"):
             twin = measure_twin(model, _batch(config, *TWIN_SIZE, 1), config.seconds / 4)
         yield _twin_section(twin)
     yield Section("", [], details={"peak_gigabytes": peak_gigabytes()})
-    if config.plots is not None:
-        device = _results.device_name(session)
-        path = config.plots / _plots.file_name(f"train step {device}")
-        _plots.bars(path, f"training step, {size}, {device}", "ms a step", _bars(steps), stacked=True)
 
 
 def _batch(config: TrainStepBench, height: int, width: int, count: int) -> Batch:
@@ -129,13 +124,3 @@ def _twin_section(twin: Record) -> Section:
     )
     size = "x".join(map(str, TWIN_SIZE))
     return Section(f"training step with torch's splat, {size}, batch 1", rows, notes, {"twin": twin})
-
-
-def _bars(steps: Sequence[Record]) -> dict[str, dict[str, Any]]:
-    """By stage, forward above backward, variant by variant."""
-    bars: dict[str, dict[str, Any]] = {}
-    for step in steps:
-        for way in (FORWARD, BACKWARD):
-            for stage, spread in step[way].items():
-                bars.setdefault(stage, {})[f"{step['name']}, {way}"] = spread
-    return bars

@@ -9,7 +9,6 @@ import torch
 from rich.console import Console
 
 from vestcl import opencl
-from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.table import Section
@@ -91,7 +90,7 @@ def _check(config: PipelineBench) -> None:
         raise ValueError("`scenes` must be one or more, got none")
 
 
-def _sections(config: PipelineBench, model: Forecaster, session: opencl.Session, console: Console) -> Iterator[Section]:
+def _sections(config: PipelineBench, model: Forecaster, _: opencl.Session, console: Console) -> Iterator[Section]:
     """All scenes on one device, as they come."""
     size, scenes = f"{config.height}x{config.width}", []
     for name in dict.fromkeys(config.scenes):
@@ -107,6 +106,3 @@ def _sections(config: PipelineBench, model: Forecaster, session: opencl.Session,
     about = {"skip": model.skip, "effort": model.effort, "autocast": model.autocast and str(model.autocast)}
     about |= {"scenes": {scene["name"]: scene for scene in scenes}, "counts": counts}
     yield Section("", [], details=about | {"peak_gigabytes": peak_gigabytes()})
-    if config.plots is not None:
-        path = config.plots / _plots.file_name(f"pipeline {_results.device_name(session)}")
-        _report.plot(path, f"forecast step, {size}, {_results.device_name(session)}", scenes)

@@ -1,17 +1,13 @@
 """What `vestcl bench pipeline` found, as sections of tables and figures, and as a plot."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Final
 
-from vestcl.bench.common import plots as _plots
 from vestcl.bench.common.results import X_COPY
 from vestcl.bench.common.table import Measurement, Section, busy
-from vestcl.bench.common.timing import Spread
 from vestcl.bench.pipeline.measure import ALL, COPY, INPAINT, NONE, PEER, Record
 from vestcl.bench.pipeline.traffic import EMPTY, EVERYTHING, JAM, TRAFFIC
 from vestcl.models.inference.skipping import Count
-from vestcl.models.inference.stage_times import REST, STAGES
 
 #: Scene -> what the step may take as a multiple of PEER's, and what share of it skipping must save at least.
 OF_PEER: Final = {EMPTY: 0.25, TRAFFIC: 0.5, JAM: 0.5}
@@ -92,7 +88,12 @@ def sections(scenes: Sequence[Record]) -> Iterator[Section]:
         for stage, spread in one["stages"][variant].items()
         for name in [f"{one['name']}: {variant}: {stage}"]
     ]
-    yield Section("stages with nothing and with all skipped, ms", stages, ("Medians.",))
+    stages += [
+        Measurement(PEER, f"{one['name']}, {PEER}", one["seconds"][PEER], "s", ".1f")
+        for one in scenes
+        if PEER in one["seconds"]
+    ]
+    yield Section("stages with nothing and with all skipped, ms", stages, ("Medians.",), stacked=True)
     images = [row for one in scenes for row in _image_rows(one)]
     yield Section("images, dB PSNR", images, ("Means over the drives' steps; inf: the same.",))
     left_out = [
@@ -122,19 +123,3 @@ def _image_rows(scene: Record) -> Iterator[Measurement]:
 def counted(count: Count) -> str:
     """ "73 % of 1,277,952 px"."""
     return f"{count.skipped / count.of if count.of else 0.0:.0%} of {count.of:,} {count.unit}"
-
-
-def plot(path: Path, title: str, scenes: Sequence[Record]) -> Path:
-    """Stacked bars of stages, nothing skipped above all skipped, DMVFN below, scene by scene.
-
-    Raises:
-        ValueError: the folder can't be made.
-    """
-    bars: dict[str, dict[str, Spread]] = {stage: {} for stage in (*STAGES.values(), REST, PEER)}
-    for one in scenes:
-        for variant in (NONE, ALL):
-            for stage, spread in one["stages"][variant].items():
-                bars[stage][f"{one['name']}, {variant}"] = spread
-        if PEER in one["seconds"]:
-            bars[PEER][f"{one['name']}, {PEER}"] = one["seconds"][PEER]
-    return _plots.bars(path, title, "ms a forecast step", bars, stacked=True)

@@ -111,6 +111,7 @@ def series_rows(title: str, speeds: Sequence[Record]) -> Iterator[Measurement]:
             yield Measurement(facts.size, f"{key} ms", one["time"], "s", ".2f", name)
             yield Measurement(facts.size, f"{key} ns/pixel", _per_pixel(one["time"], facts))
             yield Measurement(facts.size, f"{key} x copy", one["copies"]["spread"], digits=".1f", name=name + X_COPY)
+        yield Measurement(facts.size, "copy ms", speed["forward_copy"]["time"], "s", ".2f")
         yield Measurement(facts.size, "copy ns/pixel", _per_pixel(speed["forward_copy"]["time"], facts))
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -11,7 +10,6 @@ import torch
 from rich.console import Console
 
 from vestcl import opencl, reference
-from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.options import Options
@@ -183,7 +181,7 @@ def _distance(got: torch.Tensor, true: torch.Tensor) -> float:
 # ---------------------------------------------------------------- one device's results
 
 
-def _sections(config: OperatorsBench, session: opencl.Session, console: Console) -> Iterator[Section]:
+def _sections(config: OperatorsBench, _: opencl.Session, console: Console) -> Iterator[Section]:
     torch.manual_seed(config.seed)
     timed: list[Record] = []
     for operator in operators(config):
@@ -195,12 +193,11 @@ def _sections(config: OperatorsBench, session: opencl.Session, console: Console)
         *busy(*(one["others_cores"] for one in timed)),
     )
     rows = [row for one in timed for row in _rows(one)]
-    yield Section(f"Operators, {size}", rows, notes, {"operators": timed})
-    if config.plots is not None:
-        _plot(config.plots, session.info, timed)
+    columns = ("ms (quartiles)", "twin ms", "copy ms"), ("kernels ms", "around ms")
+    yield Section(f"Operators, {size}", rows, notes, {"operators": timed}, columns)
     if config.roofline:
         scene = street(config.height, config.width, config.channels, config.radius, config.seed)
-        yield roofline.section(roofline.roofline(scene), config.plots)
+        yield roofline.section(roofline.roofline(scene))
 
 
 def _rows(one: Record) -> Iterator[Measurement]:
@@ -209,24 +206,10 @@ def _rows(one: Record) -> Iterator[Measurement]:
     yield Measurement(name, "runs", str(one["time"].runs))
     yield Measurement(name, "MB", one["moved_bytes"], "B", ".1f")
     yield Measurement(name, "GB/s", f"{one['moved_bytes'] / 1e9 / one['time'].median:.1f}")
+    yield Measurement(name, "copy ms", one["copy"], "s", ".2f")
     yield Measurement(name, "x copy", one["x_copy"], digits=".1f", name=name + X_COPY)
     yield Measurement(name, "kernels ms", one["kernels"], "s", ".2f", f"{name}, kernels")
     yield Measurement(name, "around ms", one["around"], "s", ".2f", f"{name}, around kernels")
     yield Measurement(name, "twin ms", one["twin"], "s", ".2f")
     yield Measurement(name, "x twin", one["x_twin"], "1", ".1f", f"{name}, twin / vestcl", "higher")
     yield Measurement(name, "error", one["error"], digits=".0e")
-
-
-def _plot(folder: Path, info: opencl.DeviceInfo, timed: list[Record]) -> None:
-    """Times beside reference and copy, and where the time goes."""
-    device = f"{info.platform} / {info.name}"
-    charts = {
-        "Operators": {"time": "vestcl", "twin": "torch reference", "copy": "copy of the bytes"},
-        "Operators inside": {"kernels": "kernels", "around": "around kernels"},
-    }
-    for title, fields in charts.items():
-        groups = {
-            label: {f"{one['operator']}\n{one['what']}": one[field] for one in timed} for field, label in fields.items()
-        }
-        path = folder / _plots.file_name(f"{title} {info.index}")
-        _plots.bars(path, f"{title}\n{device}", "ms", groups, log=True)

@@ -8,15 +8,13 @@ turns with the kernels: a copy past the cache, and chains of multiply-adds, both
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import tyro
 from rich.console import Console
 
 from vestcl import opencl
-from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.table import Measurement, Section, busy
@@ -79,7 +77,7 @@ def main(config: RooflineBench) -> None:
 def _sections(config: RooflineBench, session: opencl.Session, _: Console) -> Iterator[Section]:
     for radius in config.radii:
         scene = street(config.height, config.width, config.channels, radius, config.seed)
-        yield section(roofline(scene, config.calls), config.plots)
+        yield section(roofline(scene, config.calls))
 
 
 def roofline(scene: Scene, calls: int = CALLS, copy_bytes: int = COPY_BYTES) -> Record:
@@ -156,58 +154,35 @@ class _Roofs:
             job.launch(_FILE, "multiply_add", defines, (self._items,), [*numbers, self._sums], (self._local,))
 
 
-def section(result: Record, plots: Path | None) -> Section:
-    """A row a kernel, the roofs below; with a plot in the folder ``plots``."""
-    title, roofs = f"Roofline, {result['facts'].size} px", (result["bandwidth"].median, result["peak"].median)
-    if plots is not None:
-        plot(plots / _plots.file_name(f"{opencl.current().info.name} {title}"), title, result)
-    notes = f"roofs: {roofs[0] / 1e9:.1f} GB/s copied, {roofs[1] / 1e9:.0f} Gflop/s", *busy(result["others_cores"])
-    return Section(title, list(_rows(result)), notes, {"rooflines": [result]})
+def section(result: Record) -> Section:
+    """A row a kernel, the roofs below."""
+    roofs = f"roofs: {result['bandwidth'].median / 1e9:.1f} GB/s copied, {result['peak'].median / 1e9:.0f} Gflop/s"
+    notes = roofs, *busy(result["others_cores"])
+    title, columns = f"Roofline, {result['facts'].size} px", (("ms", "least ms"),)
+    return Section(title, [*_rows(result)], notes, {"rooflines": [result]}, columns)
 
 
 def _rows(result: Record) -> Iterator[Measurement]:
     radius = f", radius {result['facts'].radius:g}"
     for name, unit in (("bandwidth", "B/s"), ("peak", "flop/s")):
         yield Measurement(name, "", result[name], unit, name=f"roofline {name}{radius}", better="higher")
+    least = 0.0
     for point in result["points"]:
         row, share, seconds = point["name"], point["share"], point["time"].median
         moved, flops = point["moved_bytes"], point["flops"]
-        cells = {"launches": f"{point['launches']}", "ms": f"{seconds * 1e3:.3f}", "MB": f"{moved / 1e6:.1f}"}
-        cells |= {"Mflop": f"{flops / 1e6:.1f}", "flop/byte": f"{flops / moved:.2f}"}
-        cells |= {"GB/s": f"{moved / seconds / 1e9:.1f}", "Gflop/s": f"{flops / seconds / 1e9:.1f}"}
-        cells |= {"bound by": point["bound"]}
-        for column, text in cells.items():
-            yield Measurement(row, column, text)
+        least += share.median * seconds
+        yield Measurement(row, "launches", str(point["launches"]))
+        yield Measurement(row, "ms", point["time"], "s", ".3f")
+        yield Measurement(row, "least ms", share.median * seconds, "s", ".3f")
+        yield Measurement(row, "bound by", point["bound"])
         yield Measurement(row, "of the roof", f"{share.median:.0%} ({share.low:.0%}-{share.high:.0%})")
         yield Measurement(row, "", share, name=f"roofline {row}{radius}", better="higher")
-    least = sum(point["share"].median * point["time"].median for point in result["points"])
-    for row, key in (("all kernels", "kernels"), ("no kernel running", "between")):
-        yield Measurement(row, "ms", result[key], "s", ".3f")
+        work = {"MB": moved / 1e6, "Mflop": flops / 1e6, "flop/byte": flops / moved}
+        for column, value in (work | {"GB/s": moved / seconds / 1e9, "Gflop/s": flops / seconds / 1e9}).items():
+            yield Measurement(row, column, value, digits=".1f")
+    yield Measurement("all kernels", "ms", result["kernels"], "s", ".3f")
     yield Measurement("all kernels", "of the roof", least / result["kernels"], digits=".0%")
-
-
-def plot(path: Path, title: str, result: Record) -> Path:
-    """Draw the roofs, and below them the kernels that compute, on logarithmic axes.
-
-    Raises:
-        ValueError: the folder can't be made.
-    """
-    figure = _plots.blank(4.5)
-    axes: Any = figure.subplots()
-    bandwidth, peak = result["bandwidth"].median, result["peak"].median
-    computing = [point for point in result["points"] if point["flops"]]
-    places = [point["flops"] / point["moved_bytes"] for point in computing]
-    x = np.geomspace(min([*places, peak / bandwidth]) / 4, max([*places, peak / bandwidth]) * 4, 200)
-    axes.plot(x, np.minimum(x * bandwidth, peak) / 1e9, color="black", label=f"{bandwidth / 1e9:.0f} GB/s copied")
-    for point, place in zip(computing, places, strict=True):
-        reached, share = point["flops"] / point["time"].median / 1e9, point["share"].median
-        (drawn,) = axes.plot(place, reached, "o", label=f"{point['name']}, {share:.0%}")
-        axes.plot([place, place], [reached, reached / share], ":", color=drawn.get_color())
-    labels = {"xlabel": "flops for each byte that must move", "ylabel": "Gflop/s"}
-    axes.set(xscale="log", yscale="log", title=title, **labels)
-    axes.grid(alpha=0.3, which="both", linewidth=0.5)
-    axes.legend(fontsize=8)
-    return _plots.write(figure, path)
+    yield Measurement("no kernel running", "ms", result["between"], "s", ".3f")
 
 
 if __name__ == "__main__":
