@@ -13,9 +13,8 @@ from PIL import Image
 
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.timing import Spread
-from vestcl.bench.pipeline import report as _pipeline_report
 from vestcl.bench.pipeline import traffic as _traffic
-from vestcl.bench.pipeline.bench import PipelineBench, load, main
+from vestcl.bench.pipeline.bench import PipelineBench, load, main, verdicts, word
 from vestcl.bench.pipeline.measure import ALL, NONE, PEER, SWITCHES, TWICE, Stepper, variants
 from vestcl.bench.pipeline.traffic import EMPTY, EVERYTHING, JAM, STREETS, TRAFFIC, drive
 from vestcl.models.config import EncoderConfig
@@ -158,14 +157,14 @@ def test_a_run_writes_and_prints_everything(
         assert picture.width > 1000 and len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
     events = json.loads((tmp_path / "trace.json").read_text(encoding="utf-8"))["traceEvents"]
     assert {"encode", "splat", NONE, ALL, PEER, EMPTY} <= {event["name"] for event in events}
-    for word in (
+    for text in (
         "forecast step, empty road (0% foreground)",
         "views alone",
         "targets",
         "skipping saves",
         "empty tiles",
     ):
-        assert word in printed and word in (tmp_path / "pipeline.md").read_text(encoding="utf-8")
+        assert text in printed and text in (tmp_path / "pipeline.md").read_text(encoding="utf-8")
 
 
 def whole_runs(found: dict[str, Any]) -> int:
@@ -192,8 +191,8 @@ def test_verdicts(name: str, of_peer: float, saved: float, loss: float | None, c
     if loss is not None:
         pictures = {"truth_nothing": 30 + loss, "truth_all": 30.0}
     scene = {"name": name, "saved_share": {ALL: always(saved)}, "of_peer": always(of_peer), "pictures": pictures}
-    targets = _pipeline_report.verdicts(scene | {"others_cores": cores})
-    assert [_pipeline_report.word(target) for target in targets] == words
+    targets = verdicts(scene | {"others_cores": cores})
+    assert [word(target) for target in targets] == words
 
 
 def test_load_takes_quality_and_precision(tmp_path: Path) -> None:

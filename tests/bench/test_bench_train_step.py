@@ -12,7 +12,7 @@ from PIL import Image
 
 from vestcl.bench.common import results as _results
 from vestcl.bench.network import train_step
-from vestcl.bench.network.train_measure import (
+from vestcl.bench.network.train_step import (
     ADAM,
     BACKWARD,
     EVERYTHING_LEARNS,
@@ -22,10 +22,11 @@ from vestcl.bench.network.train_measure import (
     TWIN,
     Batch,
     Trainer,
+    TrainStepBench,
+    main,
     measure_twin,
     stacked,
 )
-from vestcl.bench.network.train_step import TrainStepBench, main
 from vestcl.bench.pipeline.traffic import LEAST_FRAMES, TRAFFIC, drive
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.stage_times import REST, STAGES
