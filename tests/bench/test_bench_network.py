@@ -11,11 +11,9 @@ from rich.console import Console
 
 from vestcl.bench.common.timing import Spread
 from vestcl.bench.network import bench as network
-from vestcl.bench.network.bench import NetworkBench, Stopwatch, TimedForecaster
+from vestcl.bench.network.bench import NetworkBench
 from vestcl.constants import SKY_DEPTH
 from vestcl.data.street.raycast import STREET_SKY_DEPTH as STREET_SKY
-from vestcl.models import configuration
-from vestcl.models.forecaster import Forecaster
 
 TINY: dict[str, Any] = {"height": 32, "width": 64, "runs": 2}
 
@@ -54,20 +52,6 @@ def test_without_training(tmp_path: Path) -> None:
     assert [part["title"] for part in json.loads(path.read_text(encoding="utf-8"))["parts"]] == ["vest-s, forecast"]
 
 
-def test_a_timed_forecast_is_the_forecast() -> None:
-    config = configuration("vest-s")
-    timed = TimedForecaster(config).eval()
-    plain = Forecaster(config).eval()
-    plain.load_state_dict(timed.state_dict())
-    frames, K = network.street_frames(32, 64, 3)
-    pair, camera = [network.street_layers(frame) for frame in frames[:2]], torch.from_numpy(K)[None].float()
-    prior = network.prior_of(timed, pair[1])
-    with torch.no_grad():
-        images = [model(*pair, camera, prior=prior).views[0].image for model in (timed, plain)]
-    assert torch.equal(*images)
-    assert set(timed.watch.wall) == STAGES
-
-
 def test_layers_of_the_street() -> None:
     frames, _ = network.street_frames(32, 64, 3)
     frame = frames[0]
@@ -78,17 +62,6 @@ def test_layers_of_the_street() -> None:
     assert torch.equal(layers.image, torch.from_numpy(frame.colour))
     foreground = torch.from_numpy(np.isin(frame.labels, (5, 11, 13)))
     assert foreground.any() and torch.equal(layers.mask == 0, foreground)
-
-
-def test_the_stopwatch_sums_stages_up() -> None:
-    watch = Stopwatch()
-    for _ in range(2):
-        with watch.time("a"):
-            pass
-    once = watch.wall["a"]
-    with watch.time("a"), watch.time("b"):
-        sum(range(10_000))
-    assert watch.wall["a"] > once and watch.wall["b"] <= watch.wall["a"] and set(watch.cpu) == {"a", "b"}
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,18 @@ def run(network: Forecaster, seed: int = 1, views: int = 1) -> torch.Tensor:
         return network(*pair, K, [(torch.eye(4)[None], K)] * views, prior=prior).views[0].image
 
 
+def test_the_stopwatch_sums_stages_up() -> None:
+    with watching() as outer, watching() as watch:
+        for _ in range(2):
+            with watch.time("a"):
+                pass
+        once = watch.seconds["a"]
+        with watch.time("a"), watch.time("b"):
+            sum(range(10_000))
+    assert watch.seconds["a"] > once and watch.seconds["b"] <= watch.seconds["a"]
+    assert set(watch.cpu_seconds) == {"a", "b"} and outer.seconds == watch.seconds
+
+
 def test_all_stages_are_timed_and_the_model_is_as_it_was() -> None:
     network = model()
     before, inside = dict(vars(network)), list[dict[str, Any]]()

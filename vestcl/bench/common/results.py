@@ -100,15 +100,7 @@ class Results:
 
 
 def run(bench: str, config: Options, measure: Callable[[opencl.Session, Console], Iterator[Section]]) -> list[Results]:
-    """Measure on every device that is asked for, print section after section, and write the files.
-
-    Args:
-        bench: as in `vestcl bench NAME`.
-        config: of the benchmark.
-        measure: of one device, which is vestcl's current one.
-
-    Returns:
-        Results by device.
+    """`vestcl bench BENCH`: ``measure`` every device that is asked for, print section after section, write the files.
 
     Raises:
         DeviceError: as `measure_each`.
@@ -158,16 +150,10 @@ def collect(
 
 
 def measure_each(selector: str | None, measure: Callable[[opencl.Session], Results], console: Console) -> list[Results]:
-    """``measure`` on one device or on all; of all, those that fail are reported, and the others go on.
+    """``measure`` the device that ``selector`` means as in `opencl.select`, which is vestcl's current one meanwhile.
 
-    Args:
-        selector: as in `opencl.select`; or "all": every device that passes `vestcl doctor`, each tried in a process of
-            its own first, because a driver may kill the one that loads it.
-        measure: of one device, which is vestcl's current one.
-        console: where failures are reported.
-
-    Returns:
-        The results of the devices that did not fail, one at least.
+    "all" means every device that passes `vestcl doctor`, each tried in a process of its own first, because a driver may
+    kill the one that loads it. Those that fail are reported, and the others go on.
 
     Raises:
         DeviceError: no such device, or with "all" none that works.

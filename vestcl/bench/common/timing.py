@@ -72,7 +72,10 @@ def interleave(tasks: Mapping[str, Task], seconds: float, least: int = LEAST_ROU
     times: dict[str, list[float]] = {name: [] for name in tasks}
     shuffle, order = random.Random(0).shuffle, list(tasks.items())
     end = time.perf_counter() + seconds
-    with _no_collection():
+    collects = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
         for number in range(MOST_ROUNDS):
             if number >= least and time.perf_counter() > end:
                 break
@@ -83,19 +86,10 @@ def interleave(tasks: Mapping[str, Task], seconds: float, least: int = LEAST_ROU
                 result = task()
                 times[name].append(time.perf_counter() - start)
                 del result
-    return {name: np.array(values) for name, values in times.items()}
-
-
-@contextlib.contextmanager
-def _no_collection() -> Iterator[None]:
-    enabled = gc.isenabled()
-    gc.collect()
-    gc.disable()
-    try:
-        yield
     finally:
-        if enabled:
+        if collects:
             gc.enable()
+    return {name: np.array(values) for name, values in times.items()}
 
 
 @contextlib.contextmanager

@@ -1,11 +1,9 @@
 """`vestcl bench network`: one forecast stage by stage, one training step, and the memory that they take."""
 
-import contextlib
 import dataclasses
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -22,7 +20,8 @@ from vestcl.data import Frame, Street, intrinsics
 from vestcl.data.street.raycast import STREET_SKY_DEPTH
 from vestcl.io.labels import background
 from vestcl.models import ModelConfig, configuration
-from vestcl.models.forecaster import Forecaster, Step
+from vestcl.models.forecaster import Forecaster
+from vestcl.models.inference.stage_times import Stopwatch, watching
 from vestcl.models.steps.prior import MotionPrior, nothing_moves
 from vestcl.scene import layers
 from vestcl.scene.layers import LayerBatch
@@ -42,15 +41,8 @@ WARM_UP: Final = 1
 #: Stage: unproject, rigid flow, displace and splat, forward and backward; a part of the others.
 OPENCL: Final = "all OpenCL, both ways"
 
-#: Methods of a `Forecaster`, and as tables name them.
-STAGES: Final = {
-    "encode": "encode",
-    "move_camera": "camera motion (EMF)",
-    "move_objects": "object motion (OMF)",
-    "lift": "lift",
-    "splat": "displace and splat",
-    "paint": "refine",
-}
+#: Stages of a `Forecaster`, as the table names them where it is not by `stage_times.STAGES`.
+_NAMES: Final = {"EMF": "camera motion (EMF)", "OMF": "object motion (OMF)", "splat": "displace and splat"}
 
 #: Of Adam (SPEC section 7).
 LEARNING_RATE: Final = 1e-4
@@ -78,46 +70,9 @@ class NetworkBench(DeviceOptions):
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
 
 
-@dataclass
-class Stopwatch:
-    """Seconds of named stages, summed up over one run."""
-
-    wall: dict[str, float] = field(default_factory=dict)
-    cpu: dict[str, float] = field(default_factory=dict)
-
-    @contextlib.contextmanager
-    def time(self, name: str) -> Iterator[None]:
-        wall, cpu = time.perf_counter(), time.process_time()
-        yield
-        self.wall[name] = self.wall.get(name, 0.0) + time.perf_counter() - wall
-        self.cpu[name] = self.cpu.get(name, 0.0) + time.process_time() - cpu
-
-
 #: Deviation of the last layers' weights of object motion, metres: as it is made it changes nothing, and would not run
 #: where it does not learn.
 _STIRRED: Final = 1e-5
-
-Model = TypeVar("Model", bound=Forecaster)
-
-
-class TimedForecaster(Forecaster):
-    """A `Forecaster` whose stages report their times, wall and CPU, to its ``watch``."""
-
-    def __init__(self, config: ModelConfig) -> None:
-        super().__init__(config)
-        self.watch = Stopwatch()
-
-
-def _timed(method: str, name: str) -> Callable[..., Any]:
-    def stage(self: TimedForecaster, *arguments: Any) -> Any:
-        with self.watch.time(name):
-            return getattr(Forecaster, method)(self, *arguments)
-
-    return stage
-
-
-for _method, _name in STAGES.items():
-    setattr(TimedForecaster, _method, _timed(_method, _name))
 
 
 def main(config: NetworkBench) -> None:
@@ -133,7 +88,7 @@ def main(config: NetworkBench) -> None:
     with opencl.use(config.device) as session, _timing.torch_threads(config.threads):
         machine = _results.describe(session)
         _results.show_machine(machine, console)
-        model = made(TimedForecaster, model_config, config.seed)
+        model = made(model_config, config.seed)
         model.skip = dataclasses.replace(model.skip, seen=False)  # the frames are the same ones in all runs
         frames, K = street_frames(config.height, config.width, config.seed)
         parts = list(_parts(config, console, model, frames, torch.from_numpy(K)[None].float()))
@@ -157,10 +112,10 @@ def street_layers(frame: Frame) -> LayerBatch:
     return layers.batch([layers.build_layers(frame.colour[0], frame.depth[0], background(frame.labels[0]), sky=sky)])
 
 
-def made(kind: type[Model], config: ModelConfig, seed: int) -> Model:
+def made(config: ModelConfig, seed: int) -> Forecaster:
     """A network as at the start of a training, but with object motion that does something."""
     torch.manual_seed(seed)
-    model = kind(config)
+    model = Forecaster(config)
     for block in () if model.object_motion is None else model.object_motion.blocks:
         for parameter in block.get_submodule("out").parameters():
             nn.init.normal_(parameter, std=_STIRRED)
@@ -173,67 +128,56 @@ def prior_of(model: Forecaster, frame: LayerBatch) -> MotionPrior | None:
 
 
 def _parts(
-    config: NetworkBench, console: Console, model: TimedForecaster, frames: Sequence[Frame], K: torch.Tensor
+    config: NetworkBench, console: Console, model: Forecaster, frames: Sequence[Frame], K: torch.Tensor
 ) -> Iterator[dict[str, Any]]:
     """Measure and print part after part. Memory only grows, so the training step comes last."""
 
     def several(tensor: torch.Tensor) -> torch.Tensor:
         return tensor.repeat(config.batch, *(1,) * (tensor.ndim - 1))
 
-    def forecast() -> Step:
-        with model.watch.time("inpaint"):
+    def forecast(watch: Stopwatch) -> None:
+        with watch.time("inpaint"):
             pair = [street_layers(frame) for frame in frames[:2]]
-        with torch.no_grad(), model.watch.time("forward"):
-            return model(*pair, K, prior=prior_of(model, pair[1]))
+        with torch.no_grad(), watch.time("forward"):
+            model(*pair, K, prior=prior_of(model, pair[1]))
 
     model.eval()
-    yield show(config, console, _measure(f"{config.model}, forecast", model, forecast, "forward", config.runs))
+    yield show(config, console, _measure(f"{config.model}, forecast", forecast, "forward", config.runs))
     if config.training:
         pair = [LayerBatch(*map(several, street_layers(frame))) for frame in frames[:2]]
         truth, cameras = several(torch.from_numpy(frames[2].colour)), several(K)
         adam = torch.optim.Adam(model.train().parameters(), LEARNING_RATE)
 
-        def train() -> None:
-            with model.watch.time("training step"):
-                train_once(model, adam, pair, truth, cameras)
+        def train(watch: Stopwatch) -> None:
+            session, busy = opencl.current(), opencl.current().seconds
+            with watch.time("training step"):
+                adam.zero_grad(set_to_none=True)
+                with watch.time("all of forward"):
+                    image = model(*pair, cameras, prior=prior_of(model, pair[1])).views[0].image
+                    loss = nn.functional.l1_loss(image, truth)
+                with watch.time("backward"):
+                    loss.backward()
+                with watch.time("Adam"):
+                    adam.step()
+            watch.add(OPENCL, session.seconds - busy, 0.0)
 
         title = f"{config.model}, training, batch {config.batch}"
-        yield show(config, console, _measure(title, model, train, "training step", config.runs))
+        yield show(config, console, _measure(title, train, "training step", config.runs))
 
 
-def train_once(
-    model: TimedForecaster,
-    adam: torch.optim.Optimizer,
-    pair: Sequence[LayerBatch],
-    truth: torch.Tensor,
-    K: torch.Tensor,
-) -> float:
-    """One step down the L1 loss; the loss."""
-    adam.zero_grad(set_to_none=True)
-    session, busy = opencl.current(), opencl.current().seconds
-    with model.watch.time("all of forward"):
-        loss = nn.functional.l1_loss(model(*pair, K, prior=prior_of(model, pair[1])).views[0].image, truth)
-    with model.watch.time("backward"):
-        loss.backward()
-    with model.watch.time("Adam"):
-        adam.step()
-    model.watch.wall[OPENCL], model.watch.cpu[OPENCL] = session.seconds - busy, 0.0
-    return loss.item()
-
-
-def _measure(title: str, model: TimedForecaster, task: Callable[[], object], whole: str, runs: int) -> dict[str, Any]:
+def _measure(title: str, task: Callable[[Stopwatch], None], whole: str, runs: int) -> dict[str, Any]:
     """A forecast or a training step, its stages first and the whole last; memory is the most that was taken so far."""
-    for _ in range(WARM_UP):
-        task()
     watches = []
+    for _ in range(WARM_UP):
+        task(Stopwatch())
     with _timing.watching_others() as others:
         for _ in range(runs):
-            model.watch = Stopwatch()
-            task()
-            watches.append(model.watch)
-    wall, cpu = (Spread.of_each([getattr(watch, kind) for watch in watches]) for kind in ("wall", "cpu"))
+            with watching() as watch:
+                task(watch)
+            watches.append(watch)
+    wall, cpu = (Spread.of_each([getattr(watch, kind) for watch in watches]) for kind in ("seconds", "cpu_seconds"))
     names = sorted(wall, key=lambda name: name == whole)
-    timings = [{"name": name, "wall": wall[name], "cpu": cpu[name]} for name in names]
+    timings = [{"name": _NAMES.get(name, name), "wall": wall[name], "cpu": cpu[name]} for name in names]
     memory = {"peak_gigabytes": _timing.peak_gigabytes(), "others_cores": others.cores}
     return {"title": title, "timings": timings, **memory}
 

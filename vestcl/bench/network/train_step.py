@@ -89,7 +89,7 @@ def _sections(
     config: TrainStepBench, model_config: ModelConfig, _: opencl.Session, console: Console
 ) -> Iterator[Section]:
     """Everything on one device: variants, stages, and torch's splat."""
-    model = made(Forecaster, model_config, config.seed).train()
+    model = made(model_config, config.seed).train()
     with console.status("training steps"):
         steps = measure_steps(model, _batch(config, config.height, config.width, config.batch), config.seconds)
     size = f"{config.model}, {config.height}x{config.width}, batch {config.batch}"

@@ -83,17 +83,7 @@ class Drive:
 
 
 def drive(name: str, height: int, width: int, frames: int, seed: int) -> Drive:
-    """A scene by its name.
-
-    Args:
-        name: one of STREETS, or EVERYTHING.
-        height: of the pictures, px.
-        width: of the pictures, px.
-        frames: of the drive, LEAST_FRAMES or more.
-        seed: of the street.
-
-    Returns:
-        The scene; windows' tensors are float32, B = 1.
+    """One of STREETS or EVERYTHING, with at least LEAST_FRAMES ``frames`` of ``height`` x ``width`` px, float32, B = 1.
 
     Raises:
         ValueError: another name, or too few frames.
@@ -132,9 +122,9 @@ def _scattered(frames: list[Prepared]) -> Iterator[Window]:
     """Two windows without a common frame, so that none was seen in the step before."""
     K, aside = torch.from_numpy(frames[0].K[None]).float(), torch.eye(4)[None]
     aside[:, 0, 3] = -_ASIDE
-    pictures = [torch.from_numpy(frame.layers.image.copy())[None] for frame in frames[:2]]
-    pictures += [picture.flip(3) for picture in pictures]
-    for prev, cur in (pictures[:2], pictures[2:]):
+    images = [torch.from_numpy(frame.layers.image.copy())[None] for frame in frames[:2]]
+    images += [image.flip(3) for image in images]
+    for prev, cur in (images[:2], images[2:]):
         moving = torch.full_like(cur, _MOVED)
         prior = nothing_moves(cur)._replace(velocity_prev=moving, velocity_cur=moving)
         given = NetworkInput(_dotted(prev), _dotted(cur), K, prior)

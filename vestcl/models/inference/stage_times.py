@@ -51,16 +51,28 @@ class Stopwatch:
     """Seconds by stage, summed up until `take`."""
 
     seconds: dict[str, float] = field(default_factory=dict)
+    cpu_seconds: dict[str, float] = field(default_factory=dict)
+    """Of all threads of the process."""
     seen: Seen | None = None
     """Called after each stage, outside of what is timed."""
     outer: "Stopwatch | None" = field(default=None, repr=False, compare=False)
     """The clock of the ``with`` block around this one's: it runs as well."""
 
-    def add(self, name: str, seconds: float) -> None:
+    def add(self, name: str, seconds: float, cpu_seconds: float) -> None:
         """Add to this clock and to all outer ones."""
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+        self.cpu_seconds[name] = self.cpu_seconds.get(name, 0.0) + cpu_seconds
         if self.outer is not None:
-            self.outer.add(name, seconds)
+            self.outer.add(name, seconds, cpu_seconds)
+
+    @contextlib.contextmanager
+    def time(self, name: str) -> Iterator[None]:
+        """Add the time that the ``with`` block takes."""
+        start, cpu_start = time.perf_counter(), time.process_time()
+        try:
+            yield
+        finally:
+            self.add(name, time.perf_counter() - start, time.process_time() - cpu_start)
 
     def show(self, name: str, result: Any) -> None:
         """Call ``seen`` of this clock and of all outer ones."""
@@ -70,8 +82,8 @@ class Stopwatch:
             self.outer.show(name, result)
 
     def take(self) -> dict[str, float]:
-        """What was measured since the last time."""
-        taken, self.seconds = self.seconds, {}
+        """What was measured since the last time, without the CPU's."""
+        taken, self.seconds, self.cpu_seconds = self.seconds, {}, {}
         return taken
 
 
@@ -103,13 +115,9 @@ def timed(method: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
 
     @functools.wraps(method)
     def stage(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
-        watch, start = _watch.get(), time.perf_counter()
-        try:
-            with trace.stage(name), record_function(name):
-                result = method(*arguments, **named)
-        finally:
-            if watch is not None:
-                watch.add(name, time.perf_counter() - start)
+        watch = _watch.get()
+        with trace.stage(name), record_function(name), contextlib.nullcontext() if watch is None else watch.time(name):
+            result = method(*arguments, **named)
         if watch is not None:
             watch.show(name, result)
         return result
