@@ -138,15 +138,15 @@ def _grid(before: Results, after: Results, changes: pd.DataFrame) -> Grid:
     for change in changes.to_dict("records"):
         ranges = (_range(change, when) for when in ("before", "after"))
         unit = _UNITS.get(change["unit"], change["unit"])
-        rows.append((change["name"], unit, *ranges, f"{change['percent']:+.1f}", change["verdict"]))
+        rows.append((change["name"], change["verdict"], f"{change['percent']:+.1f}", unit, *ranges))
     names = (result.machine.get("device", "unknown device") for result in (before, after))
     dates = " -> ".join(result.machine.get("date", "?") for result in (before, after))
     title = f"vestcl bench {after.bench}, {' -> '.join(dict.fromkeys(names))}, {dates}"
     notes = (
-        "noise: the ranges between the quartiles overlap. machine: they don't, but the ratio to the copy stays, so the",
-        "machine is slower or faster, not vestcl.",
+        "noise: the ranges between the quartiles overlap.",
+        "machine: they don't, but the ratio to the copy stays: the machine is slower or faster, not vestcl.",
     )
-    return Grid(title, ("", "unit", "before (quartiles)", "after (quartiles)", "change, %", ""), tuple(rows), notes)
+    return Grid(title, ("", "", "change, %", "unit", "before (quartiles)", "after (quartiles)"), tuple(rows), notes)
 
 
 def _range(change: dict[str, float], when: str) -> str:

@@ -35,7 +35,7 @@ _VERDICTS: Final = {"reached": "green", "missed": "red", "can't tell": "yellow",
 _AGAIN: Final = "measure again"
 
 #: Columns of the screen around a cell.
-_AROUND: Final = 3
+_AROUND: Final = 2
 
 #: As long as a heading gets in one line.
 _HEADING: Final = 8
@@ -139,7 +139,7 @@ def verdict(reached: bool, others_cores: float | None = None) -> str:
 
 
 def show_grid(grid: Grid, console: Console) -> None:
-    """Print a table; where it is too wide, its columns go on in another one below, behind the same first column."""
+    """Print a table; where it is too wide, its columns go on below, behind the same first column."""
     console.print(Text(grid.title, "bold"))
     for part in fitting(grid, console.width):
         table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
@@ -157,14 +157,14 @@ def fitting(grid: Grid, width: int) -> Iterator[Grid]:
     """``grid`` in parts that fit ``width`` columns, each with the first column."""
     cells = [(*_stacked(heading).split("\n"), *of) for heading, *of in zip(grid.heading, *grid.rows, strict=True)]
     sizes = [max(map(len, column)) + _AROUND for column in cells]
-    start, count = 1, len(sizes)
+    start, count, label = 1, len(sizes), min(sizes[0], _LABEL) + 1
     while start < count:
-        end, room = start + 1, width - min(sizes[0], _LABEL) - sizes[start]
+        end, room = start + 1, width - label - sizes[start]
         while end < count and sizes[end] <= room:
             room -= sizes[end]
             end += 1
         heading, *rows = ((row[0], *row[start:end]) for row in (grid.heading, *grid.rows))
-        yield Grid(grid.title, heading, tuple(rows), grid.notes)
+        yield Grid(grid.title, heading, tuple(row for row in rows if start == 1 or any(row[1:])), grid.notes)
         start = end
 
 

@@ -1,7 +1,6 @@
 """Clocks: tasks timed in turns, so that what slows the machine down slows all of them, and copies as yardsticks."""
 
 import contextlib
-import ctypes
 import gc
 import os
 import random
@@ -32,9 +31,6 @@ PAUSE: Final = 0.01
 
 #: The share of the machine that other processes may keep busy before no target counts as reached or missed.
 QUIET_SHARE: Final = 0.05
-
-#: Of glibc's mallopt: what `recycling_allocator` changes, and glibc's defaults (M_MMAP_MAX, M_TRIM_THRESHOLD).
-_DEFAULTS: Final = ((-4, 65536), (-1, 128 * 1024))
 
 
 @dataclass(frozen=True)
@@ -98,13 +94,10 @@ def recycling_allocator() -> Iterator[bool]:
 
     Yields whether it does; other C libraries are left as they are.
     """
-    keeps = keep_freed_memory()
     try:
-        yield keeps
+        yield keep_freed_memory()
     finally:
-        mallopt: Any = ctypes.CDLL(None).mallopt if keeps else lambda *_: None
-        for parameter, default in _DEFAULTS:
-            mallopt(parameter, default)
+        keep_freed_memory(False)
 
 
 @contextlib.contextmanager

@@ -12,20 +12,8 @@ from vestcl import opencl
 from vestcl.bench.common import results
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.table import Section, busy
-from vestcl.bench.splat import pytorch3d, torch_peer
+from vestcl.bench.splat import measure, pytorch3d, torch_peer
 from vestcl.bench.splat.kernels import facts_of
-from vestcl.bench.splat.measure import (
-    growth_notes,
-    kernel_rows,
-    measure_kernels,
-    measure_memory,
-    measure_peers,
-    measure_speed,
-    memory_rows,
-    peer_rows,
-    series_rows,
-    speed_rows,
-)
 from vestcl.bench.splat.scenes import CHANNELS, Scene, street
 from vestcl.opencl import trace
 
@@ -83,8 +71,10 @@ def _sections(config: SplatBench, session: opencl.Session, console: Console) -> 
     for scene, radius in zip(scenes, config.radii, strict=True):
         with _stage(console, f"splat beside copies, radius {radius:g}"):
             targets = TARGETS.get((*size, radius), (None, None))
-            found = measure_speed(scene, config.seconds, threads, targets)
-        yield Section(found["facts"].title, [*speed_rows(found)], busy(found["others_cores"]), {"speed": [found]})
+            found = measure.measure_speed(scene, config.seconds, threads, targets)
+        yield Section(
+            found["facts"].title, [*measure.speed_rows(found)], busy(found["others_cores"]), {"speed": [found]}
+        )
     if config.peers:
         yield from _peers(config, console, scenes)
     yield from _inside(console, scenes)
@@ -104,9 +94,9 @@ def _peers(config: SplatBench, console: Console, scenes: Sequence[Scene]) -> Ite
         console.print("PyTorch3D is not installed: skipped")
     for scene, peers in pairs:
         with _stage(console, f"splat beside {', '.join(peers)}"):
-            found = measure_peers(scene, peers, config.seconds)
+            found = measure.measure_peers(scene, peers, config.seconds)
         title = f"{found['facts'].title}; errors relative to the reference in float64"
-        yield Section(title, [*peer_rows(found)], busy(found["others_cores"]), {"peers": [found]})
+        yield Section(title, [*measure.peer_rows(found)], busy(found["others_cores"]), {"peers": [found]})
     yield Section("", [], details={"peers_compiled": compiled})
 
 
@@ -126,12 +116,14 @@ def _inside(console: Console, scenes: Sequence[Scene]) -> Iterator[Section]:
     """Kernels and memory."""
     for scene in scenes:
         with _stage(console, "kernels"):
-            found = measure_kernels(scene)
+            found = measure.measure_kernels(scene)
         title = f"Kernels of one forward + backward, radius {found['radius']:g} px"
         notes = busy(found["others_cores"])
-        yield Section(title, [*kernel_rows(found)], notes, {"kernels": [found]}, plots=(("ms",),))
-    memories = [measure_memory(scene) for scene in scenes]
-    yield Section("Scratch memory of forward + backward", [*memory_rows(memories)], details={"memory": memories})
+        yield Section(title, [*measure.kernel_rows(found)], notes, {"kernels": [found]}, plots=(("ms",),))
+    memories = [measure.measure_memory(scene) for scene in scenes]
+    yield Section(
+        "Scratch memory of forward + backward", [*measure.memory_rows(memories)], details={"memory": memories}
+    )
 
 
 def _series(
@@ -141,11 +133,11 @@ def _series(
     speeds = []
     for size in sizes:
         with _stage(console, f"{title} {size}"):
-            speeds.append(measure_speed(street(*size, config.seed), config.seconds, config.threads))
+            speeds.append(measure.measure_speed(street(*size, config.seed), config.seconds, config.threads))
     if speeds:
         notes, columns = busy(*(speed["others_cores"] for speed in speeds)), (("forward ms", "both ms", "copy ms"),)
-        rows = [*series_rows(title, speeds)]
-        yield Section(title, rows, (*growth_notes(speeds), *notes), {name: speeds}, columns)
+        rows = [*measure.series_rows(title, speeds)]
+        yield Section(title, rows, (*measure.growth_notes(speeds), *notes), {name: speeds}, columns)
 
 
 @contextlib.contextmanager
