@@ -24,7 +24,7 @@ from vestcl.bench.network.train_step import (
     Trainer,
     TrainStepBench,
     main,
-    measure_twin,
+    measure_reference,
     stacked,
 )
 from vestcl.bench.pipeline.traffic import LEAST_FRAMES, TRAFFIC, drive
@@ -83,7 +83,7 @@ def test_a_step_moves_what_learns_alone(variant: str) -> None:
 
 
 def test_torchs_splat_takes_over_and_goes_again() -> None:
-    times = measure_twin(model(), batch(), 0.01)
+    times = measure_reference(model(), batch(), 0.01)
     assert (vars(_render)["rasterize"], vars(_render)["composite"]) == (rasterize, composite)
     assert {OURS, TWIN} == {*times["whole"]} == {*times["splat"]}
     assert all(0 < times["splat"][name].median < times["whole"][name].median for name in (OURS, TWIN))

@@ -1,7 +1,7 @@
 """`vestcl bench compare A.json B.json`: what changed between two runs of a benchmark, and whether noise can do it.
 
 A measure has changed where the ranges between its quartiles don't overlap. Where it is a time with a ratio to a copy of
-the same bytes beside it, that ratio must have changed in the same direction, too: else it is the machine that changed.
+the same bytes next to it, that ratio must have changed in the same direction, too: else it is the machine that changed.
 """
 
 from collections.abc import Iterator, Sequence

@@ -163,7 +163,7 @@ def measure_each(selector: str | None, measure: Callable[[opencl.Session], Resul
         with opencl.use(index) as session:
             try:
                 results.append(measure(session))
-            except Exception as error:  # drivers fail in many ways, and runtime alone knows pyopencl's
+            except Exception as error:  # drivers fail in many ways, and only runtime knows pyopencl's
                 if isinstance(error, ValueError) or selector != ALL:  # a mistake in the settings is no device's
                     raise
                 _report(console, session.info, f"{type(error).__name__}: {error}")
@@ -197,7 +197,7 @@ def write_json(path: Path, results: dict[str, Any]) -> None:
     """Write ``results`` whole or not at all; ``path`` is the old file until then.
 
     Raises:
-        TypeError: something that JSON does not have.
+        TypeError: a value that JSON does not have.
         ValueError: the folder can't be made.
     """
     atomic.write_bytes(path, (json.dumps(results, indent=1) + "\n").encode())
@@ -299,7 +299,7 @@ def plain(value: Any) -> Any:
     """``value`` as JSON has it: dataclasses become objects, tuples and arrays lists, paths text, NaN and infinity null.
 
     Raises:
-        ValueError: something that JSON has no word for.
+        ValueError: a value that JSON does not have.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return plain(vars(value))

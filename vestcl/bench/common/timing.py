@@ -147,12 +147,12 @@ class Others:
     """What `watching_others` saw."""
 
     cores: float | None = None
-    """Cores that other processes kept busy; None where /proc does not tell."""
+    """Cores that other processes kept busy; None where /proc does not say."""
 
 
 @contextlib.contextmanager
 def watching_others() -> Iterator[Others]:
-    """Tell, when the ``with`` block ends, how busy other processes kept the machine meanwhile."""
+    """Measure, until the ``with`` block ends, how busy other processes keep the machine."""
     others = Others()
     start, before = time.perf_counter(), _others_seconds()
     yield others

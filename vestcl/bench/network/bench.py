@@ -113,7 +113,7 @@ def street_layers(frame: Frame) -> LayerBatch:
 
 
 def made(config: ModelConfig, seed: int) -> Forecaster:
-    """A network as at the start of a training, but with object motion that does something."""
+    """A network as at the start of a training, but with object motion that has an effect."""
     torch.manual_seed(seed)
     model = Forecaster(config)
     for block in () if model.object_motion is None else model.object_motion.blocks:
@@ -183,7 +183,7 @@ def _measure(title: str, task: Callable[[Stopwatch], None], whole: str, runs: in
 
 
 def show(config: NetworkBench, console: Console, part: dict[str, Any]) -> dict[str, Any]:
-    """Print what `_measure` found beside its targets, and hand it on."""
+    """Print what `_measure` found with its targets, and hand it on."""
     targets, cores = TARGETS.get((config.model, config.height, config.width), {}), part["others_cores"]
     rows = list[Measurement]()
     for timing in part["timings"]:

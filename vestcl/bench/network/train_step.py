@@ -109,8 +109,8 @@ def _sections(
     yield Section("stages, ms", rows, (note,), stacked=True)
     if config.twin:
         with console.status("a step with torch's splat"):
-            twin = measure_twin(model, _batch(config, *TWIN_SIZE, 1), config.seconds / 4)
-        yield _twin_section(twin)
+            twin = measure_reference(model, _batch(config, *TWIN_SIZE, 1), config.seconds / 4)
+        yield _reference_section(twin)
     yield Section("", [], details={"peak_gigabytes": peak_gigabytes()})
 
 
@@ -130,7 +130,7 @@ def _variant_rows(step: Record) -> Iterator[Measurement]:
     yield Measurement(name, "OpenCL's share", f"{step['opencl'].median / step['whole'].median:.1%}")
 
 
-def _twin_section(twin: Record) -> Section:
+def _reference_section(twin: Record) -> Section:
     ratio, worst = twin["splat"][TWIN].median / twin["splat"][OURS].median, twin["gradient_difference"]
     rows = [Measurement("", "", worst, name="small step: gradients' difference")]
     for by in (OURS, TWIN):
@@ -248,7 +248,7 @@ def measure_steps(model: Forecaster, batch: Batch, seconds: float) -> list[Recor
     return found
 
 
-def measure_twin(model: Forecaster, batch: Batch, seconds: float) -> Record:
+def measure_reference(model: Forecaster, batch: Batch, seconds: float) -> Record:
     """A step with OpenCL's splat and one with the torch reference's, in turns; all else is the same.
 
     Args:

@@ -42,7 +42,7 @@ class PipelineBench(Options):
     model: str = "vest-s"
     """A trained network: a name that ships with vestcl, a file or a checkpoint's folder."""
     scenes: tuple[Literal["empty road", "traffic", "jam", "everything"], ...] = (EMPTY, TRAFFIC, JAM, EVERYTHING)
-    """"everything" needs all of a step: there skipping can but cost."""
+    """"everything" needs all of a step: there skipping only costs."""
     height: int = 256
     """Pixels, a multiple of 16."""
     width: int = 832
@@ -60,7 +60,7 @@ class PipelineBench(Options):
     accelerated: bool = True
     """The network as `vestcl.models.inference.fast.accelerate` lays it out."""
     peers: bool = True
-    """Beside DMVFN's network on the same frames, too."""
+    """Also DMVFN's network on the same frames."""
 
 
 def main(config: PipelineBench) -> None:

@@ -6,7 +6,7 @@
     everything      no street: foreground scattered all over two walls, all of it moving, every frame another one, seen
                     from the side, so that nothing can be skipped but points that the newer frame covers
 
-Depth and masks are given, everything else is measured as in use: the camera's motion and things' velocities by
+Depth and masks are given, everything else is measured as in use: the camera's motion and objects' velocities by
 `Perception`, outside of all timing.
 """
 
@@ -49,7 +49,7 @@ _SCATTERED: Final = 5.0
 #: ... in dots of so many px, one every so many: a footprint reaches from one's edge to the next's.
 _DOT: Final = 3
 _EVERY: Final = 8
-#: ... m that the view is beside the camera: dots then leave holes as wide as they are, everywhere.
+#: ... m that the view is to the side of the camera: dots then leave holes as wide as they are, everywhere.
 _ASIDE: Final = 0.54
 
 

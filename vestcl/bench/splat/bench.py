@@ -69,7 +69,7 @@ def _sections(config: SplatBench, session: opencl.Session, console: Console) -> 
     size, threads = (config.height, config.width), config.threads
     scenes = [street(*size, CHANNELS, radius, config.seed) for radius in config.radii]
     for scene, radius in zip(scenes, config.radii, strict=True):
-        with _stage(console, f"splat beside copies, radius {radius:g}"):
+        with _stage(console, f"splat next to copies, radius {radius:g}"):
             targets = TARGETS.get((*size, radius), (None, None))
             found = measure.measure_speed(scene, config.seconds, threads, targets)
         yield Section(
@@ -93,7 +93,7 @@ def _peers(config: SplatBench, console: Console, scenes: Sequence[Scene]) -> Ite
     else:
         console.print("PyTorch3D is not installed: skipped")
     for scene, peers in pairs:
-        with _stage(console, f"splat beside {', '.join(peers)}"):
+        with _stage(console, f"splat next to {', '.join(peers)}"):
             found = measure.measure_peers(scene, peers, config.seconds)
         title = f"{found['facts'].title}; errors relative to the reference in float64"
         yield Section(title, [*measure.peer_rows(found)], busy(found["others_cores"]), {"peers": [found]})

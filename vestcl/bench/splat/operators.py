@@ -1,4 +1,4 @@
-"""`vestcl bench operators`: each operator beside its reference in torch and a copy of its bytes, both passes."""
+"""`vestcl bench operators`: each operator next to its reference in torch and a copy of its bytes, both passes."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -52,16 +52,16 @@ class OperatorsBench(Options):
     seconds: float = 5.0
     """About how long each operator is measured."""
     roofline: bool = False
-    """Also each splat kernel beside the roofs of its device: memory bandwidth and arithmetic."""
+    """Also each splat kernel against the roofs of its device: memory bandwidth and arithmetic."""
 
 
 @dataclass(frozen=True, eq=False)
 class Operator:
-    """What is timed: an operator with arguments, and its twin."""
+    """What is timed: an operator with arguments, and its reference implementation."""
 
     name: str
     ours: Callable[..., Any]
-    twin: Callable[..., Any]
+    reference: Callable[..., Any]
     arguments: tuple[Any, ...]
     differentiated: tuple[int, ...]
     """Which of the arguments get gradients."""
@@ -129,7 +129,7 @@ def measure(operator: Operator, seconds: float, threads: int) -> list[Record]:
     """
     outputs = operator.run(operator.ours)
     grads = tuple(torch.randn_like(output) for output in outputs)
-    runs = {"vestcl": _passes(operator, operator.ours, grads), "twin": _passes(operator, operator.twin, grads)}
+    runs = {"vestcl": _passes(operator, operator.ours, grads), "twin": _passes(operator, operator.reference, grads)}
     moved = _moved_bytes(operator, outputs)
     # Ones, not zeros: memory that was never written is one page of zeros, and reading it costs nothing.
     copies = {what: _timing.copies_of_forward(torch.ones(size // 8), threads) for what, size in moved.items()}
@@ -189,11 +189,11 @@ def _sections(config: OperatorsBench, _: opencl.Session, console: Console) -> It
             timed += measure(operator, config.seconds, config.threads)
     size = f"{config.height}x{config.width}, C = {config.channels}, radius {config.radius:g} px, float32"
     notes = (
-        "x copy: over a copy of the same bytes. kernels, around: of profiled calls. twin: vestcl.reference.",
+        "x copy: over a copy of the same bytes. kernels, around: of profiled calls.",
         *busy(*(one["others_cores"] for one in timed)),
     )
     rows = [row for one in timed for row in _rows(one)]
-    columns = ("ms (quartiles)", "twin ms", "copy ms"), ("kernels ms", "around ms")
+    columns = ("ms (quartiles)", "reference ms", "copy ms"), ("kernels ms", "around ms")
     yield Section(f"Operators, {size}", rows, notes, {"operators": timed}, columns)
     if config.roofline:
         scene = street(config.height, config.width, config.channels, config.radius, config.seed)
@@ -210,6 +210,6 @@ def _rows(one: Record) -> Iterator[Measurement]:
     yield Measurement(name, "x copy", one["x_copy"], digits=".1f", name=name + X_COPY)
     yield Measurement(name, "kernels ms", one["kernels"], "s", ".2f", f"{name}, kernels")
     yield Measurement(name, "around ms", one["around"], "s", ".2f", f"{name}, around kernels")
-    yield Measurement(name, "twin ms", one["twin"], "s", ".2f")
-    yield Measurement(name, "x twin", one["x_twin"], "1", ".1f", f"{name}, twin / vestcl", "higher")
+    yield Measurement(name, "reference ms", one["twin"], "s", ".2f")
+    yield Measurement(name, "x reference", one["x_twin"], "1", ".1f", f"{name}, twin / vestcl", "higher")
     yield Measurement(name, "error", one["error"], digits=".0e")

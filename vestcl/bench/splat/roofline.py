@@ -1,4 +1,4 @@
-"""Each splat kernel beside the roofs of its device: `vestcl bench operators --roofline`.
+"""Each splat kernel against the roofs of its device: `vestcl bench operators --roofline`.
 
 A kernel that moves b bytes and computes f flops takes at least max(b / bandwidth, f / peak). Both roofs are measured in
 turns with the kernels: a copy past the cache, and chains of multiply-adds, both in OpenCL
