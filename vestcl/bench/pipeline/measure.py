@@ -25,7 +25,7 @@ from vestcl.scene.layers import build_layers
 
 Record = dict[str, Any]
 
-#: What else is timed in turns with the variants: the peer, a copy of the frames' layers, and what a new frame needs before.
+#: Also timed, in turns with the variants: the peer, a copy of the frames' layers, and what a new frame needs before.
 PEER, COPY, INPAINT = "DMVFN", "copy", "inpaint"
 
 NONE, ALL = "nothing skipped", "all skipped"
