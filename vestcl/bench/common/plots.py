@@ -23,6 +23,9 @@ _DOTS: Final = 150
 _AROUND: Final = 1.2
 _BAR: Final = 0.28
 
+#: Room to the right of the longest bar for its number, as a factor of the axis's length.
+_ROOM: Final = 1.18
+
 #: Points of a title: a device's name fits on a line.
 TITLE: Final = 10
 
@@ -100,9 +103,14 @@ def bars(path: Path, title: str, frame: pd.DataFrame, stacked: bool = False) -> 
     around = None if stacked else [[median[name] - low[name], high[name] - median[name]] for name in median]
     median.plot.barh(ax=axes, stacked=stacked, logx=not stacked, xerr=around, width=0.8, legend=False)
     drawn = [container for container in axes.containers if isinstance(container, BarContainer)]
-    for container in drawn[-1:] if stacked else drawn:
-        axes.bar_label(container, fmt="%.3g", fontsize=7, padding=3)
-    axes.margins(x=0.18)
+    if stacked:
+        wholes = median.sum(axis=1)
+        axes.bar_label(drawn[-1], [f"{whole:.3g}" for whole in wholes], fontsize=7, padding=3)
+        axes.set_xlim(0, _ROOM * wholes.max())
+    else:
+        for container in drawn:
+            axes.bar_label(container, fmt="%.3g", fontsize=7, padding=3)
+        axes.margins(x=_ROOM - 1)
     axes.invert_yaxis()
     axes.set(xlabel="ms", ylabel="")
     return _finish(figure, path, title)

@@ -109,7 +109,7 @@ def roofline(scene: Scene, calls: int = CALLS, copy_bytes: int = COPY_BYTES) -> 
     peak = Spread.of(roofs.flops / found.seconds.pop("multiply_add"))
     facts = facts_of(scene)
     moved, flops, points = bytes_of(scene, facts), flops_of(facts), list[Record]()
-    for name in found.seconds.keys() & moved.keys():
+    for name in (name for name in found.seconds if name in moved):
         by_memory, by_compute = moved[name] / bandwidth.median, flops.get(name, 0) / peak.median
         points.append({
             "name": name,
@@ -120,7 +120,6 @@ def roofline(scene: Scene, calls: int = CALLS, copy_bytes: int = COPY_BYTES) -> 
             "share": Spread.of(max(by_memory, by_compute) / found.seconds[name]),
             "bound": "memory" if by_memory >= by_compute else "compute",
         })  # fmt: skip
-    points.sort(key=lambda point: list(found.seconds).index(point["name"]))
     seconds = {"kernels": float(np.median(found.kernels)), "between": float(np.median(found.around))}
     result = {"facts": facts, "bandwidth": bandwidth, "peak": peak, "points": points, "call": Spread.of(found.calls)}
     return result | seconds | {"others_cores": found.others_cores}
