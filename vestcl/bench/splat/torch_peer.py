@@ -18,7 +18,6 @@ alpha lacks it.
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import torch
@@ -31,16 +30,9 @@ from vestcl.bench.splat.scenes import Scene
 _LOG_OF_ZERO: Final = -800.0
 
 
-class Candidates(NamedTuple):
-    """Step 2: n points, k x k pixels each; dx [n, k] and dy [n, k] lead from the point to their centres."""
-
-    alphas: torch.Tensor
-    """[n, k, k], without meaning where there is no fragment."""
-    pixels: torch.Tensor
-    """[n, k, k] int32."""
-    dx: torch.Tensor
-    dy: torch.Tensor
-
+Candidates = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+"""Step 2: n points, k x k pixels each: alphas [n, k, k], without meaning where there is no fragment; pixels [n, k, k]
+int32; dx and dy [n, k], which lead from the point to the pixels' centres."""
 
 Expand = Callable[..., Candidates]
 
@@ -59,7 +51,7 @@ def expand(
     d2 = down[:, :, None] + across[:, None, :]
     alphas = opacities[:, None, None] * (1 - d2 / r2[:, :, None])
     places = (y.int() * width)[:, :, None] + x.int()[:, None, :]
-    return Candidates(alphas, torch.where(d2 < r2[:, :, None], places, height * width), dx, dy)
+    return alphas, torch.where(d2 < r2[:, :, None], places, height * width), dx, dy
 
 
 def compiled_expand() -> Expand:
@@ -73,13 +65,15 @@ def compiled_expand() -> Expand:
     return compiled
 
 
-@dataclass(frozen=True)
-class Fragments:
-    """Steps 1 to 4. F fragments by pixel and front to back."""
+class Fragments(NamedTuple):
+    """Steps 1 to 4: n points front to back with their candidates, and F fragments by pixel and front to back."""
 
     order: torch.Tensor
-    """[n], the points front to back."""
-    candidates: Candidates
+    """[n], of the points."""
+    pixels: torch.Tensor
+    """[n, k, k], of the candidates."""
+    dx: torch.Tensor
+    dy: torch.Tensor
     places: torch.Tensor
     """[F], where among the candidates a fragment is."""
     points: torch.Tensor
@@ -94,7 +88,7 @@ class Fragments:
     @property
     def weights(self) -> torch.Tensor:
         """[F], in the features' precision."""
-        return (self.alphas * self.transmittances).to(self.candidates.dx.dtype)
+        return (self.alphas * self.transmittances).to(self.dx.dtype)
 
 
 def list_fragments(
@@ -113,14 +107,14 @@ def list_fragments(
     bits = z[order].view(torch.int32 if z.dtype == torch.float32 else torch.int64)
     order = order[torch.sort(bits, stable=True).indices]
     k = math.ceil(2 * float(radii.detach().max()))  # an open interval of length 2 r holds at most so many pixel centres
-    candidates = Candidates(*expanding(u[order], v[order], radii[order], opacities[order], k, *size))
-    pixels, places = torch.sort(candidates.pixels.view(-1), stable=True)
-    counts = torch.bincount(pixels, minlength=height * width)[: height * width]
+    candidates, pixels, dx, dy = expanding(u[order], v[order], radii[order], opacities[order], k, *size)
+    by_pixel, places = torch.sort(pixels.view(-1), stable=True)
+    counts = torch.bincount(by_pixel, minlength=height * width)[: height * width]
     starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
     places = places[: starts[-1]]
-    points = order[places // k**2]
-    alphas = candidates.alphas.view(-1)[places].double()
-    return Fragments(order, candidates, places, points, starts, alphas, _transmittances(alphas, starts))
+    alphas = candidates.view(-1)[places].double()
+    transmittances = _transmittances(alphas, starts)
+    return Fragments(order, pixels, dx, dy, places, order[places // k**2], starts, alphas, transmittances)
 
 
 def _transmittances(alphas: torch.Tensor, starts: torch.Tensor) -> torch.Tensor:
@@ -189,7 +183,7 @@ def _products(fragments: Fragments, features: torch.Tensor, grad_image: torch.Te
 
 def _grad_features(fragments: Fragments, grad_image: torch.Tensor, count: int) -> torch.Tensor:
     """Fragments of one point are neighbours among the candidates; those that are none weigh 0."""
-    candidates = fragments.candidates.pixels.view(len(fragments.order), -1)
+    candidates = fragments.pixels.view(len(fragments.order), -1)
     weights = grad_image.new_zeros(candidates.numel())
     weights[fragments.places] = fragments.weights
     pixels = candidates.clamp(max=len(grad_image) - 1).view(-1)
@@ -212,8 +206,8 @@ def _grad_geometry(
     fragments: Fragments, grad_alphas: torch.Tensor, radii: torch.Tensor, opacities: torch.Tensor
 ) -> list[torch.Tensor]:
     """Gradients of points_uv [N, 2], radii [N] and opacities [N]."""
-    order, (_, pixels, dx, dy) = fragments.order, fragments.candidates
-    dense = grad_alphas.new_zeros(pixels.shape)
+    order, dx, dy = fragments.order, fragments.dx, fragments.dy
+    dense = grad_alphas.new_zeros(fragments.pixels.shape)
     dense.view(-1)[fragments.places] = grad_alphas
     across, down = dense.sum(1), dense.sum(2)
     r, slope = radii[order], 2 * opacities[order] / radii[order] ** 2
