@@ -13,14 +13,11 @@ from forecaster_scenes import SMALL, stir
 from vestcl.bench.common.results import load
 from vestcl.bench.common.timing import Spread
 from vestcl.bench.pareto import bench as pareto
-from vestcl.bench.pareto import plots as _pareto_plots
-from vestcl.bench.pareto import splatter as _pareto_splatter
+from vestcl.bench.pareto import plots
 from vestcl.bench.pareto.bench import ParetoBench
 from vestcl.bench.pareto.front import PRICE, Point, front, knee
 from vestcl.bench.pareto.knobs import EXACT, Setting, combinations, combined, describe
 from vestcl.bench.pareto.scenes import double, scene, shrunk
-from vestcl.bench.splat.scenes import street
-from vestcl.bench.splat.torch_fragments import list_fragments
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import quality
 from vestcl.models.inference.effort import Effort
@@ -92,17 +89,6 @@ def test_several_steps(details: dict[str, Any]) -> None:
     assert rows["compose", 5]["psnr"]["median"] < rows["compose", 1]["psnr"]["median"]
 
 
-def test_the_splatters_own_knobs(details: dict[str, Any]) -> None:
-    splatter = details["splatter"]
-    errors = [choice["error"] for choice in splatter["fragments"]]
-    assert errors == sorted(errors, reverse=True) and errors[0] > 0.1 and errors[-1] < 1e-6
-    assert [choice["value"] for choice in splatter["fragments"] if choice["default"]] == ["all"]
-    single, half = splatter["features"]
-    assert single["error"] < 1e-6 < half["error"] < 1e-3 and half["seconds"] is None
-    assert {int(choice["value"]) for choice in splatter["tile"]} == set(_pareto_splatter.SIDES)
-    assert all(choice["error"] < 1e-6 and choice["seconds"]["median"] > 0 for choice in splatter["tile"])
-
-
 def test_files(folder: Path, details: dict[str, Any]) -> None:
     markdown = (folder / "p.md").read_text(encoding="utf-8")
     assert all(f"**{name}" in markdown for name in details["knobs"]) and "bfloat16" in markdown
@@ -110,7 +96,6 @@ def test_files(folder: Path, details: dict[str, Any]) -> None:
     assert drawn == {
         "front",
         "recursion",
-        "splatter",
         *(name.replace(" ", "-").replace("_", "-") for name in details["knobs"]),
     }
     measures = json.loads((folder / "new" / "p.json").read_text(encoding="utf-8"))["devices"][0]["measures"]
@@ -119,12 +104,12 @@ def test_files(folder: Path, details: dict[str, Any]) -> None:
 
 
 def test_figures_show_what_there_is(details: dict[str, Any]) -> None:
-    figure = _pareto_plots.knob_figure("precision", details["knobs"]["precision"])
+    figure = plots.knob_figure("precision", details["knobs"]["precision"])
     left, right = figure.axes
     assert {text.get_text() for text in left.texts} == {"float32", "bfloat16"}
-    assert right.get_xlabel() == "ms a step" and right.get_legend() is not None
-    (axes,) = _pareto_plots.front_figure(details["front"]).axes
-    assert {text.get_text() for text in axes.texts} == set(quality.LEVELS)
+    assert right.get_xlabel() == "ms/step" and right.get_legend() is not None
+    (axes,) = plots.front_figure(details["front"]).axes
+    assert {text.get_text() for text in axes.texts if text.get_text()} == set(quality.LEVELS)
 
 
 def point(value: str, seconds: float, loss: float, noise: float = 0.0) -> Point:
@@ -143,13 +128,10 @@ def test_front_and_knee_by_hand() -> None:
         knee([])
 
 
-def test_settings_are_told_and_read() -> None:
-    for setting in (
-        EXACT,
-        Setting(NOTHING),
-        Setting(Skip(margin=3), Effort(blocks=2, paint_scale=0.5), "bfloat16", 0.5),
-    ):
-        assert Setting.of(json.loads(json.dumps(setting.plain()))) == setting
+def test_settings_are_combined_and_described() -> None:
+    for setting in (EXACT, Setting(NOTHING), Setting(Skip(margin=3), Effort(blocks=2), "bfloat16", 0.5)):
+        assert combined([setting]) == setting == combined([EXACT, setting])
+    assert EXACT.plain() == {} and Setting(Skip(margin=3)).plain() == {"skip": {"margin": 3}}
     both = combined(
         [Setting(effort=Effort(blocks=2)), Setting(Skip(margin=0)), Setting(effort=Effort(paint_scale=0.5))]
     )
@@ -171,19 +153,9 @@ def test_a_smaller_scene_is_the_same_view() -> None:
     assert np.array_equal(double(half).frame_cur.image.float(), half.frame_cur.image)
 
 
-def test_the_nearest_fragments_by_hand() -> None:
-    clouds = street(16, 32, 1, 1.5)
-    fragments = list_fragments((16, 32), clouds.points_uv[0], clouds.z[0], clouds.radii[0], clouds.opacities[0])
-    kept = _pareto_splatter.nearest(fragments, 2)
-    assert _pareto_splatter.nearest(fragments, None) is fragments
-    for pixel in range(16 * 32):
-        whole = fragments.points[fragments.starts[pixel] : fragments.starts[pixel + 1]]
-        assert kept.points[kept.starts[pixel] : kept.starts[pixel + 1]].tolist() == whole[:2].tolist()
-
-
 @pytest.mark.parametrize("change", [{"height": 0}, {"runs": 0}, {"threads": -1}])
 def test_refuses(change: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=f"`{next(iter(change))}` must be 1 or more"):
+    with pytest.raises(ValueError, match=f"`{next(iter(change))}` must be positive"):
         pareto.main(ParetoBench(**change))
     with pytest.raises(ValueError, match="`seeds` must be one or more"):
         pareto.main(ParetoBench(seeds=()))

@@ -78,13 +78,13 @@ def _splat_cloud(
     front_to_back = _drawable_points(uv, z, radii, opacities, features)
     uv, radii, opacities, features = (a[front_to_back] for a in (uv, radii, opacities, features))
 
-    point, x, y = _fragments(uv.detach(), radii.detach(), height, width)
+    point, x, y = fragments(uv.detach(), radii.detach(), height, width)
     d2 = (x + 0.5 - uv[point, 0]) ** 2 + (y + 0.5 - uv[point, 1]) ** 2
     alpha = opacities[point] * (1 - d2 / radii[point] ** 2)
 
     # Fragments of a pixel stay in the points' order: layer k holds every pixel's k-th fragment.
     pixel = y * width + x
-    layer = _rank_among_equals(pixel, height * width)
+    layer = rank_among_equals(pixel, height * width)
     layers = int(layer.max()) + 1 if len(layer) else 0
     alphas = alpha.new_zeros(layers, height * width).index_put((layer, pixel), alpha)
     if min_transmittance > 0:
@@ -110,7 +110,7 @@ def _drawable_points(
     return index[torch.sort(z.detach()[index], stable=True).indices]
 
 
-def _fragments(
+def fragments(
     uv: torch.Tensor, radii: torch.Tensor, height: int, width: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Point, column and row of every (point, pixel) with d2 < r^2, ordered by point."""
@@ -128,7 +128,7 @@ def _fragments(
     return point[inside], x[inside], y[inside]
 
 
-def _rank_among_equals(values: torch.Tensor, bound: int) -> torch.Tensor:
+def rank_among_equals(values: torch.Tensor, bound: int) -> torch.Tensor:
     """For each entry the number of equal entries before it; values in [0, bound)."""
     order = torch.sort(values, stable=True).indices
     count = torch.bincount(values, minlength=bound)

@@ -1,40 +1,41 @@
 """`vestcl bench pareto`: what each knob of a forecast saves in time and costs in error, and the best together."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
-from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.console import Console
 
 from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
-from vestcl.bench.common.results import Results
-from vestcl.bench.pareto import plots as _pareto_plots
-from vestcl.bench.pareto import report as _pareto_report
-from vestcl.bench.pareto import splatter as _pareto_splatter
-from vestcl.bench.pareto.front import PRICE, front, knee
-from vestcl.bench.pareto.knobs import EXACT, Knob, Setting, combinations, describe, knobs
+from vestcl.bench.common.options import Options
+from vestcl.bench.common.table import Measurement, Section
+from vestcl.bench.pareto import plots
+from vestcl.bench.pareto.front import PRICE, Point, front, knee
+from vestcl.bench.pareto.knobs import EXACT, Setting, combinations, describe, knobs
 from vestcl.bench.pareto.measure import Bench, measure, recursions
 from vestcl.bench.pareto.scenes import scene
-from vestcl.cli.progress import ProgressBar
 from vestcl.models.inference import pretrained, quality
 from vestcl.models.inference.fast import accelerate
 
-#: Horizons that the two ways of going on from t + 1 are compared at.
+#: Horizons at which the two ways to forecast several steps are compared.
 HORIZONS: Final = (1, 3, 5)
 
-#: Knobs that are in no combination: of "skipping" each value is exact, and "image size" is another knob's again.
+#: Knobs that are in no combination: each value of "skipping" is exact.
 ALONE: Final = ("skipping",)
 
-Tell = Callable[[str], None]
+_NOTES: Final = (
+    "time: ms/step, median and quartiles; t - 1 is remembered. x: the exact one's time over it.",
+    "rms: difference from the float64 image with nothing skipped, of 1. PSNR, MS-SSIM: against the frame that follows.",
+    "loss: mean and largest over streets of PSNR below the exact one's, dB.",
+)
 
 
 @dataclass(frozen=True)
-class ParetoBench:
-    """Turn every knob of a forecast: time against error, on procedural streets that no network was trained on."""
+class ParetoBench(Options):
+    """Vary every knob of a forecast: time against error, on procedural streets that no network was trained on."""
 
     model: str = "vest-s"
     """A trained network: a name that ships with vestcl, a file or a checkpoint's folder."""
@@ -51,19 +52,9 @@ class ParetoBench:
     combine: bool = True
     """Combine the knobs' knees, too."""
     splatter: bool = True
-    """Turn the splatter's own knobs, too."""
+    """Without effect: what it measured, the kernels do not have."""
     recursion: bool = True
     """Compare the two ways to forecast several steps, too."""
-    threads: int = 2
-    """Of torch."""
-    device: str | None = None
-    """OpenCL device: an index of `vestcl devices`, a part of its name, or "all": every one that works."""
-    json: Path | None = None
-    """File for the results."""
-    markdown: Path | None = None
-    """File for the tables."""
-    plots: Path | None = None
-    """Folder for plots (PNG): one a knob, and the front of all."""
 
 
 def main(config: ParetoBench) -> None:
@@ -73,83 +64,87 @@ def main(config: ParetoBench) -> None:
         ValueError: a size or number that is not positive, no street, or no such model.
         DeviceError: no such device.
     """
-    for name in ("height", "width", "runs", "threads"):
-        if getattr(config, name) < 1:
-            raise ValueError(f"`{name}` must be 1 or more, got {getattr(config, name)}")
+    _results.check_positive(config, "height", "width", "runs", "threads")
     if not config.seeds:
         raise ValueError("`seeds` must be one or more streets, got none")
     pretrained.find_model(config.model)
-    console = _results.console()
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with (
-        ProgressBar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
-        _timing.torch_threads(config.threads),
-        _timing.recycling_allocator(),
-    ):
-        task = bar.add_task("")
-
-        def tell(what: str) -> None:
-            bar.update(task, description=what)
-
-        results = _results.measure_each(config.device, partial(_measure_device, config, tell), console)
-    _results.show(results, console)
-    _results.save(results, config.json, config.markdown)
+    with _timing.recycling_allocator():
+        results = _results.run("pareto", config, partial(_measure, config))
     if config.plots is not None:
-        for path in _pareto_plots.draw(results, config.plots):
-            console.print(str(path), soft_wrap=True, highlight=False)
+        for number, result in enumerate(results):
+            plots.draw(result.details, config.plots, f"{number} " if len(results) > 1 else "")
 
 
-def _measure_device(config: ParetoBench, tell: Tell, session: opencl.Session) -> Results:
-    steps = max(HORIZONS) if config.recursion else 1
-    model = pretrained.load_model(config.model)
-    scenes = []
-    for seed in config.seeds:
-        tell(f"street {seed}")
-        scenes.append(scene(seed, config.height, config.width, steps))
-    tell("exact, in float64")
-    bench = Bench(model, scenes, config.runs)
+def _measure(config: ParetoBench, _: opencl.Session, console: Console) -> Iterator[Section]:
+    model, details = pretrained.load_model(config.model), dict[str, Any]()
+    with console.status("streets, and the exact forecast in float64"):
+        steps = max(HORIZONS) if config.recursion else 1
+        scenes = [scene(seed, config.height, config.width, steps) for seed in config.seeds]
+        bench = Bench(model, scenes, config.runs)
     bench.model = accelerate(model) if config.accelerated else model
-    details: dict[str, Any] = {"price": PRICE, "model": pretrained.about_model(config.model)}
+    yield Section("", [], details={"price": PRICE, "model": pretrained.about_model(config.model)})
     with _timing.watching_others() as others:
-        details["knobs"] = {knob.name: _turn(bench, knob, tell) for knob in knobs(model)}
+        best: list[list[Setting]] = []
+        for knob in knobs(model):
+            with console.status(knob.name):
+                points = measure(bench, knob.values)
+            default, bend = points[0].value, knee(points).value
+            details[knob.name] = {"about": knob.about, "default": default, "knee": bend, "points": points}
+            if knob.name not in ALONE and knob.values[bend] != EXACT:
+                best.append([EXACT, knob.values[bend]])
+            rows = _rows(points, {default: "default", bend: "knee"}, f"{knob.name} ")
+            yield Section(f"{knob.name}: {knob.about}", rows, _NOTES, {"knobs": details})
         if config.combine:
-            details["front"] = _combine(bench, details["knobs"], tell)
+            with console.status("combinations"):
+                yield _combined(bench, best)
         if config.recursion:
-            details["recursion"] = recursions(bench, HORIZONS, partial(_told, tell, "recursion"))
-        if config.splatter:
-            bench.memories.clear()
-            device = None if config.device == _results.ALL else config.device
-            sizes = config.height, config.width, device or session.info.index, config.runs
-            details["splatter"] = _pareto_splatter.measure(*sizes, partial(_told, tell, "splatter"))
-    details["others' cores"] = others.cores
-    details = _results.plain(details)
-    machine, chosen = _results.describe(session), _results.settings(config)
-    return Results("pareto", machine, chosen, _pareto_report.measures(details), _pareto_report.grids(details), details)
+            with console.status("several steps"):
+                yield _several_steps(bench)
+    yield Section("", [], details={"others' cores": others.cores})
 
 
-def _told(tell: Tell, where: str, what: str) -> None:
-    tell(f"{where}: {what}")
-
-
-def _turn(bench: Bench, knob: Knob, tell: Tell) -> dict[str, Any]:
-    points = measure(bench, dict(knob.values), partial(_told, tell, knob.name))
-    return {"about": knob.about, "default": points[0].value, "knee": knee(points).value, "points": points}
-
-
-def _combine(bench: Bench, turned: Mapping[str, Mapping[str, Any]], tell: Tell) -> dict[str, Any]:
-    """Every combination of the knobs' defaults and knees, and the named qualities, beside the exact forecast."""
-    choices = []
-    for name, knob in turned.items():
-        best = next(point for point in knob["points"] if point.value == knob["knee"])
-        if name not in ALONE and best.setting:
-            choices.append([EXACT, Setting.of(best.setting)])
+def _combined(bench: Bench, choices: Sequence[Sequence[Setting]]) -> Section:
+    """Every combination of the knobs' defaults and knees, and the named qualities, against the exact forecast."""
     named = {level: Setting(*quality.settings(level)) for level in quality.LEVELS}
     settings = {describe(setting): setting for setting in (*combinations(choices), *named.values())}
-    points = measure(bench, settings, partial(_told, tell, f"{len(settings)} combinations"))
-    best = front(points)
-    return {
-        "points": points,
-        "best": [point.value for point in best],
-        "knee": knee(points).value,
-        "qualities": {level: describe(setting) for level, setting in named.items()},
-    }
+    points = measure(bench, settings)
+    best = [point.value for point in front(points)]
+    qualities = {level: describe(setting) for level, setting in named.items()}
+    marks: dict[str, str] = dict.fromkeys(best, "front")
+    marks |= {value: f"{marks.get(value, '')} {level}".strip() for level, value in qualities.items()}
+    rows = _rows(points, marks, "combination ", only_marked=True)
+    found = {"points": points, "best": best, "knee": knee(points).value, "qualities": qualities}
+    return Section(f"best of {len(points)} combinations", rows, _NOTES, {"front": found})
+
+
+def _several_steps(bench: Bench) -> Section:
+    found, rows = recursions(bench, HORIZONS), list[Measurement]()
+    for each in found:
+        name = f"{each['mode']} to t+{each['steps']}"
+        rows += [Measurement(name, "time", each["seconds"], "s", name=f"{name}, time")]
+        rows += [Measurement(name, "PSNR", each["psnr"], "dB", ".2f", f"{name}, PSNR", "higher")]
+    notes = ("compose repeats the first motion; feedback sees each forecast frame, and encodes it.",)
+    return Section("several steps", rows, notes, {"recursion": found})
+
+
+def _rows(
+    points: Sequence[Point], marks: Mapping[str, str], prefix: str, only_marked: bool = False
+) -> list[Measurement]:
+    """Of each point a row of the table, and its figures in JSON; the exact point is the first."""
+    rows = []
+    for point in points:
+        name, exact = f"{prefix}{point.value}", points[0].seconds.median
+        has_ms_ssim = point.ms_ssim.median == point.ms_ssim.median
+        own = [
+            Measurement(point.value, "time", point.seconds, "s", name=f"{name}, time"),
+            Measurement(point.value, "x", exact / point.seconds.median, digits=".2f"),
+            Measurement(point.value, "rms", point.rms, digits=".1e", name=f"{name}, rms"),
+            Measurement(point.value, "PSNR", point.psnr, "dB", ".2f", f"{name}, PSNR", "higher"),
+            Measurement(point.value, "MS-SSIM", point.ms_ssim, "1", ".4f", f"{name}, MS-SSIM" * has_ms_ssim, "higher"),
+            Measurement(point.value, "loss", point.loss, "dB", ".3f"),
+            Measurement(point.value, "largest", point.worst, "dB", ".3f"),
+            Measurement(point.value, "is", marks.get(point.value, "")),
+        ]
+        hidden = only_marked and point.value not in marks
+        rows += [replace(measurement, column="") for measurement in own] if hidden else own
+    return rows

@@ -1,15 +1,13 @@
-"""Points of time against loss: which are worth it, and where their curve bends."""
+"""Points of time against loss: the Pareto front, and the knee of a curve."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-import numpy as np
-
 from vestcl.bench.common.timing import Spread
 
-#: dB of PSNR that half the time may cost at a knee: a difference that is hard to see side by side.
+#: dB of PSNR that half the time may cost at a knee: a difference that is hard to see in a direct comparison.
 PRICE: Final = 0.25
 
 
@@ -28,7 +26,7 @@ class Point:
     psnr: Spread
     """Over streets, dB, against the frame that really follows."""
     ms_ssim: Spread
-    """The same; NaN in pictures too small for it."""
+    """The same; NaN in images too small for it."""
     loss: float
     """Mean over streets of the default's PSNR less this one's, dB."""
     worst: float
@@ -36,7 +34,7 @@ class Point:
 
 
 def front(points: Sequence[Point]) -> list[Point]:
-    """The points that no other one beats in both time and loss, fastest last."""
+    """The Pareto front of time and loss, fastest last."""
     best: list[Point] = []
     for point in sorted(points, key=lambda p: (p.loss, p.seconds.median)):
         if not best or point.seconds.median < best[-1].seconds.median:
@@ -59,8 +57,3 @@ def knee(points: Sequence[Point]) -> Point:
     default, *others = points
     points = [default, *(point for point in others if point.seconds.high < default.seconds.low)]
     return min(points, key=lambda point: point.loss + PRICE * math.log2(point.seconds.median))
-
-
-def spread(values: Sequence[float]) -> Spread:
-    """Median and quartiles."""
-    return Spread.of(np.array(values, np.float64))

@@ -22,25 +22,15 @@ class Setting:
     """The whole forecast is made at this fraction of height and width, and enlarged."""
 
     def plain(self) -> dict[str, Any]:
-        """What differs from the defaults, as JSON has it; `Setting.of` reads it."""
+        """What differs from the defaults, as JSON has it."""
         parts = {"skip": (self.skip, Skip()), "effort": (self.effort, Effort())}
         changed: dict[str, Any] = {
-            name: {key: value for key, value in vars(own).items() if value != getattr(usual, key)}
-            for name, (own, usual) in parts.items()
+            name: {key: value for key, value in vars(own).items() if value != getattr(default, key)}
+            for name, (own, default) in parts.items()
         }
         changed |= {"autocast": self.autocast} if self.autocast else {}
         changed |= {"size": self.size} if self.size != 1 else {}
         return {name: value for name, value in changed.items() if value}
-
-    @classmethod
-    def of(cls, plain: dict[str, Any]) -> "Setting":
-        """The setting that `plain` told.
-
-        Raises:
-            TypeError: something else.
-        """
-        rest = {name: value for name, value in plain.items() if name not in ("skip", "effort")}
-        return cls(Skip(**plain.get("skip", {})), Effort(**plain.get("effort", {})), **rest)
 
 
 #: As a network is loaded: everything is exact.
@@ -49,17 +39,17 @@ EXACT: Final = Setting()
 
 @dataclass(frozen=True)
 class Knob:
-    """One quantity, turned."""
+    """One quantity that is varied."""
 
     name: str
     about: str
     """What the values are."""
-    values: tuple[tuple[str, Setting], ...]
+    values: dict[str, Setting]
     """The default first."""
 
 
-def _efforts(name: str, values: Iterable[Any]) -> tuple[tuple[str, Setting], ...]:
-    return tuple((_text(value), Setting(effort=replace(Effort(), **{name: value}))) for value in values)
+def _efforts(name: str, values: Iterable[Any]) -> dict[str, Setting]:
+    return {_text(value): Setting(effort=replace(Effort(), **{name: value})) for value in values}
 
 
 def _text(value: Any) -> str:
@@ -67,39 +57,29 @@ def _text(value: Any) -> str:
 
 
 def knobs(model: Forecaster) -> list[Knob]:
-    """What can be turned in ``model``: all that its configuration has, with the values to try."""
+    """The knobs that the configuration of ``model`` has, with the values to try."""
+    transmittances, scales = (0.0, 0.001, 0.01, 0.03, 0.1, 0.3), (1.0, 0.75, 0.5)
+    skipping = {"on": EXACT, "frames seen are encoded anew": Setting(Skip(seen=False)), "off": Setting(NOTHING)}
     found = [
-        Knob("skipping", "what changes nothing is left out", (
-            ("on", EXACT),
-            ("frames seen are encoded anew", Setting(Skip(seen=False))),
-            ("off", Setting(NOTHING)),
-        )),
-        Knob("min_transmittance", "points behind that are left out", _efforts(
-            "min_transmittance", (0.0, 0.001, 0.01, 0.03, 0.1, 0.3)
-        )),
-        Knob("splat_scale", "fraction of the view's size that clouds are splatted at", _efforts(
-            "splat_scale", (1.0, 0.75, 0.5)
-        )),
-        Knob("precision", "of encoder and refinement", (
-            ("float32", EXACT), ("bfloat16", Setting(autocast="bfloat16"))
-        )),
-        Knob("image size", "fraction of the size that all is computed at", tuple(
-            (_text(size), Setting(size=size)) for size in (1.0, 0.75, 0.5)
-        )),
-    ]  # fmt: skip
+        Knob("skipping", "what changes nothing is left out", skipping),
+        Knob("min_transmittance", "points behind that are left out", _efforts("min_transmittance", transmittances)),
+        Knob("splat_scale", "fraction of the view's size that clouds are splatted at", _efforts("splat_scale", scales)),
+        Knob("precision", "of encoder and refinement", {"float32": EXACT, "bfloat16": Setting(autocast="bfloat16")}),
+        Knob("image size", "fraction of the size that all is computed at", {_text(s): Setting(size=s) for s in scales}),
+    ]
     config = model.config
     if config.refine.base != "none":
         about = "fraction of the view's size that refinement is computed at"
-        found.append(Knob("paint_scale", about, _efforts("paint_scale", (1.0, 0.75, 0.5, 0.25))))
+        found.append(Knob("paint_scale", about, _efforts("paint_scale", (*scales, 0.25))))
     if config.object_motion is not None:
         count = len(config.object_motion.scales)
         about = f"the first of {count} blocks of object motion"
         found.append(Knob("blocks", about, _efforts("blocks", (None, *range(count - 1, -1, -1)))))
     if config.encoder.background == "frame" or (config.object_motion and config.object_motion.where == "foreground"):
-        values = tuple((f"{_text(m)}", Setting(Skip(margin=m))) for m in (None, 128, 64, 32, 16, 0))
-        found.append(Knob("margin", "pixels around the foreground that are computed with it", values))
+        margins = {_text(margin): Setting(Skip(margin=margin)) for margin in (None, 128, 64, 32, 16, 0)}
+        found.append(Knob("margin", "pixels around the foreground that are computed with it", margins))
     if config.object_motion is not None and config.object_motion.where == "foreground":
-        values = ("forecast anew", EXACT), ("taken to stand", Setting(Skip(still=True)))
+        values = {"forecast anew": EXACT, "taken to stand": Setting(Skip(still=True))}
         found.append(Knob("still", "things that were measured to stand", values))
     return found
 
@@ -108,12 +88,9 @@ def combined(settings: Sequence[Setting]) -> Setting:
     """All that ``settings`` change, at once; where two change the same, the last one counts."""
     result = EXACT
     for setting in settings:
-        parts = {name: replace(getattr(result, name), **setting.plain().get(name, {})) for name in ("skip", "effort")}
-        result = replace(
-            result, **parts,
-            autocast=setting.autocast or result.autocast,
-            size=setting.size if setting.size != 1 else result.size,
-        )  # fmt: skip
+        changed = setting.plain()
+        parts = {name: replace(getattr(result, name), **changed.pop(name, {})) for name in ("skip", "effort")}
+        result = replace(result, **parts, **changed)
     return result
 
 

@@ -1,6 +1,6 @@
-"""Figures of `vestcl bench pareto`: time to the right, error upwards, from what is in its JSON. matplotlib comes late.
+"""Figures of `vestcl bench pareto`: time to the right, error upwards, from its JSON. matplotlib is imported late.
 
-`knob_figure` and `front_figure` are what notebook 04 draws with, too.
+`knob_figure`, `front_figure` and `recursion_figure` are what notebook 04 draws with, too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from vestcl.bench.common.plots import blank, file_name, write
-from vestcl.bench.common.results import Results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,37 +16,34 @@ if TYPE_CHECKING:
 #: Inches of a figure of two axes: its height and width.
 _SIZE: Final = (4.2, 10.0)
 
-_COLOUR: Final = "#30638e"
-_MARKED: Final = "#d1495b"
+#: Next to and above the points, as a share of the axes: for their names.
+_MARGINS: Final = (0.15, 0.12)
 
-#: Beside and above the points, as a share of the axes: names stand there.
-_ROOM: Final = (0.15, 0.12)
+Points = Sequence[Mapping[str, Any]]
 
 
-def draw(results: Sequence[Results], folder: Path) -> list[Path]:
-    """A PNG a knob and one of the front, for each device; what was written.
+def draw(details: Mapping[str, Any], folder: Path, prefix: str = "") -> None:
+    """Write a PNG a knob, one of the front, and one of several steps.
+
+    Args:
+        details: of one device's results.
+        folder: made where it does not exist.
+        prefix: of the files' names.
 
     Raises:
         ValueError: the folder can't be made.
     """
-    written = []
-    for number, result in enumerate(results):
-        prefix = f"{number} " if len(results) > 1 else ""
-        for name, knob in result.details["knobs"].items():
-            written.append(write(knob_figure(name, knob), folder / file_name(f"{prefix}{name}")))
-        if "front" in result.details:
-            written.append(write(front_figure(result.details["front"]), folder / file_name(f"{prefix}front")))
-        if "splatter" in result.details:
-            figure = splatter_figure(result.details["splatter"])
-            written.append(write(figure, folder / file_name(f"{prefix}splatter")))
-        if "recursion" in result.details:
-            figure = recursion_figure(result.details["recursion"])
-            written.append(write(figure, folder / file_name(f"{prefix}recursion")))
-    return written
+    figures = {name: knob_figure(name, knob) for name, knob in details["knobs"].items()}
+    if "front" in details:
+        figures["front"] = front_figure(details["front"])
+    if "recursion" in details:
+        figures["recursion"] = recursion_figure(details["recursion"])
+    for name, figure in figures.items():
+        write(figure, folder / file_name(f"{prefix}{name}"))
 
 
 def knob_figure(name: str, knob: Mapping[str, Any]) -> "Figure":
-    """Error against float64, and PSNR lost against the true next frame, over time.
+    """Error against float64, and PSNR drop against the true next frame, over time.
 
     Args:
         name: of the knob.
@@ -55,14 +51,12 @@ def knob_figure(name: str, knob: Mapping[str, Any]) -> "Figure":
     """
     figure = blank(*_SIZE)
     left, right = figure.subplots(1, 2)
-    points = knob["points"]
-    for axes, key, label in ((left, "rms", "rms difference from float64"), (right, "loss", "PSNR lost, dB")):
-        _scatter(axes, points, key, line=True)
-        for kind, marker, size in (("default", "s", 90), ("knee", "o", 170)):
-            _mark(axes, [point for point in points if point["value"] == knob[kind]], key, kind, marker, size)
-        _name(axes, points, key)
-        axes.set(xlabel="ms a step", ylabel=label)
-        axes.grid(alpha=0.3, linewidth=0.5)
+    names = {point["value"]: point["value"] for point in knob["points"]}
+    for axes, key, label in ((left, "rms", "rms difference from float64"), (right, "loss", "PSNR drop, dB")):
+        _scatter(axes, knob["points"], key, label, names)
+        for kind, marker in (("default", "s"), ("knee", "o")):
+            x, y = _places([point for point in knob["points"] if point["value"] == knob[kind]], key)
+            axes.scatter(x, y, s=150, marker=marker, facecolors="none", edgecolors="C3", label=kind, zorder=3)
     left.set_yscale("log")
     right.legend(fontsize=8)
     figure.suptitle(f"{name}: {knob['about']}")
@@ -70,7 +64,7 @@ def knob_figure(name: str, knob: Mapping[str, Any]) -> "Figure":
 
 
 def front_figure(together: Mapping[str, Any]) -> "Figure":
-    """All combinations, those that no other one beats joined by a line, and the named qualities.
+    """All combinations, the Pareto front joined by a line, and the named qualities.
 
     Args:
         together: the results' ``details["front"]``.
@@ -78,46 +72,15 @@ def front_figure(together: Mapping[str, Any]) -> "Figure":
     figure = blank(*_SIZE)
     axes = figure.subplots()
     points = together["points"]
-    _scatter(axes, points, "loss", line=False)
-    best = sorted(
-        (point for point in points if point["value"] in together["best"]), key=lambda point: point["seconds"]["median"]
-    )
-    axes.plot(
-        [point["seconds"]["median"] * 1e3 for point in best], [point["loss"] for point in best], color=_COLOUR,
-        linewidth=1, label="no other one is better in both",
-    )  # fmt: skip
-    for level, value in together["qualities"].items():
-        chosen = [point for point in points if point["value"] == value]
-        for point in chosen:
-            place = point["seconds"]["median"] * 1e3, point["loss"]
-            axes.scatter(*place, s=120, facecolors="none", edgecolors=_MARKED, linewidths=2, zorder=3)
-            axes.annotate(level, place, (8, 8), textcoords="offset points", color=_MARKED, weight="bold")
-    axes.set(xlabel="ms a step", ylabel="PSNR lost, dB", title="Knobs together: time against error")
-    axes.grid(alpha=0.3, linewidth=0.5)
+    _scatter(axes, points, "loss", "PSNR drop, dB", {value: level for level, value in together["qualities"].items()})
+    front = sorted((p for p in points if p["value"] in together["best"]), key=lambda p: float(p["seconds"]["median"]))
+    axes.plot(*_places(front, "loss"), linewidth=1, label="Pareto front")
+    axes.set_title("Knobs together: time against error")
     axes.legend(fontsize=8)
     return figure
 
 
-def splatter_figure(knobs: Mapping[str, Sequence[Mapping[str, Any]]]) -> "Figure":
-    """Error over time of the splatter's own knobs, those values that have a time.
-
-    Args:
-        knobs: the results' ``details["splatter"]``.
-    """
-    figure = blank(*_SIZE)
-    titles = {"fragments": "fragments kept a pixel (torch's compositing)", "tile": "side of a tile, px"}
-    for axes, (name, title) in zip(figure.subplots(1, len(titles)), titles.items(), strict=True):
-        points = [{**choice, "rms": choice["error"]} for choice in knobs[name]]
-        _scatter(axes, points, "rms", line=False)
-        _mark(axes, [point for point in points if point["default"]], "rms", "default", "s", 90)
-        _name(axes, points, "rms")
-        axes.set(xlabel="ms", ylabel="rms difference from float64, of rms", title=title, yscale="log")
-        axes.grid(alpha=0.3, linewidth=0.5)
-        axes.legend(fontsize=8)
-    return figure
-
-
-def recursion_figure(rows: Sequence[Mapping[str, Any]]) -> "Figure":
+def recursion_figure(rows: Points) -> "Figure":
     """PSNR over time of both ways to forecast several steps.
 
     Args:
@@ -125,47 +88,29 @@ def recursion_figure(rows: Sequence[Mapping[str, Any]]) -> "Figure":
     """
     figure = blank(*_SIZE)
     axes = figure.subplots()
-    axes.margins(*_ROOM)
     for mode in dict.fromkeys(row["mode"] for row in rows):
-        own = [row for row in rows if row["mode"] == mode]
-        places = [(row["seconds"]["median"] * 1e3, row["psnr"]["median"]) for row in own]
-        axes.plot(*zip(*places, strict=True), marker="o", label=mode)
-        for row, place in zip(own, places, strict=True):
-            axes.annotate(f"t+{row['steps']}", place, (6, 4), textcoords="offset points", fontsize=8)
-    axes.set(xlabel="ms, all steps", ylabel="PSNR, dB", title="Several steps")
-    axes.grid(alpha=0.3, linewidth=0.5)
+        own = [{**row, "value": row["steps"]} for row in rows if row["mode"] == mode]
+        _scatter(axes, own, "psnr", "PSNR, dB", {row["steps"]: f"t+{row['steps']}" for row in own})
+        axes.plot(*_places(own, "psnr"), label=mode)
+    axes.set(xlabel="ms, all steps", title="Several steps")
     axes.legend(fontsize=8)
     return figure
 
 
-def _value(point: Mapping[str, Any], key: str) -> float:
-    value = point[key]
-    return float(value["median"] if isinstance(value, Mapping) else value)
+def _places(points: Points, key: str) -> tuple[list[float], list[float]]:
+    """Milliseconds and medians of ``key``."""
+    values = [point[key]["median"] if isinstance(point[key], Mapping) else point[key] for point in points]
+    return [point["seconds"]["median"] * 1e3 for point in points], values
 
 
-def _scatter(axes: "Axes", points: Sequence[Mapping[str, Any]], key: str, line: bool) -> None:
-    """Medians, with a bar from quartile to quartile of time."""
-    median, low, high = ([point["seconds"][part] * 1e3 for point in points] for part in ("median", "low", "high"))
-    around = [
-        [middle - end for middle, end in zip(median, low, strict=True)],
-        [end - middle for middle, end in zip(median, high, strict=True)],
-    ]
-    y = [_value(point, key) for point in points]
-    style = "-" if line else "none"
-    axes.margins(*_ROOM)
-    axes.errorbar(
-        median, y, xerr=around, color=_COLOUR, elinewidth=0.7, linestyle=style, linewidth=1, marker="o", markersize=4
-    )
-
-
-def _mark(axes: "Axes", points: Sequence[Mapping[str, Any]], key: str, label: str, marker: str, size: float) -> None:
-    x, y = [point["seconds"]["median"] * 1e3 for point in points], [_value(point, key) for point in points]
-    axes.scatter(
-        x, y, s=size, marker=marker, facecolors="none", edgecolors=_MARKED, linewidths=1.5, label=label, zorder=3
-    )
-
-
-def _name(axes: "Axes", points: Sequence[Mapping[str, Any]], key: str) -> None:
-    for point in points:
-        place = point["seconds"]["median"] * 1e3, _value(point, key)
-        axes.annotate(point["value"], place, (5, 5), textcoords="offset points", fontsize=8)
+def _scatter(axes: "Axes", points: Points, key: str, label: str, names: Mapping[Any, str]) -> None:
+    """Medians, with a bar from quartile to quartile of time, and names by value."""
+    x, y = _places(points, key)
+    low, high = ([point["seconds"][end] * 1e3 for point in points] for end in ("low", "high"))
+    around = [[m - end for m, end in zip(x, low, strict=True)], [end - m for m, end in zip(x, high, strict=True)]]
+    axes.errorbar(x, y, xerr=around, elinewidth=0.7, linestyle="none", marker="o", markersize=4)
+    for point, ms, value in zip(points, x, y, strict=True):
+        axes.annotate(names.get(point["value"], ""), (ms, value), (5, 5), textcoords="offset points", fontsize=8)
+    axes.margins(*_MARGINS)
+    axes.set(xlabel="ms/step", ylabel=label)
+    axes.grid(alpha=0.3, linewidth=0.5)

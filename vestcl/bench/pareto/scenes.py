@@ -10,18 +10,18 @@ from vestcl import geometry
 from vestcl.data import Street, street_clip
 from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.network.input import NetworkInput, last_motions, network_input
-from vestcl.models.inference.effort import enlarged, fraction, reduced
+from vestcl.models.inference.effort import fraction, reduced
 from vestcl.models.networks.layers import mapped
 from vestcl.prepare.frame import prepare_frame
 from vestcl.scene.layers import LayerBatch
 
-#: The current frame t: t - 2 and t - 1 before it tell how the camera's motion changes.
+#: The current frame t: from t - 2 and t - 1 before it the change of the camera's motion is known.
 CURRENT: Final = 2
 
 #: Seconds into the drive: an oncoming car is near.
 START: Final = 0.7
 
-#: Rays a pixel and direction: pictures as a camera's, without jagged edges.
+#: Rays per pixel and direction: images as a camera's, without jagged edges.
 SAMPLES: Final = 2
 
 
@@ -41,7 +41,7 @@ class Scene:
 
 
 def scene(seed: int, height: int, width: int, steps: int) -> Scene:
-    """A street's frames with true depth and labels, understood as `vestcl forecast` does, and the frames after them.
+    """A street's frames with true depth and labels, preprocessed as by `vestcl forecast`, and the frames after them.
 
     Args:
         seed: of the street.
@@ -62,29 +62,22 @@ def double(given: NetworkInput) -> NetworkInput:
 
 
 def shrunk(given: NetworkInput, scale: float) -> NetworkInput:
-    """The same scene at ``scale`` of its height and width: colours are means, everything else is that of a pixel."""
+    """The same scene at ``scale`` of its height and width: colours are means, all other planes are sampled."""
     height, width = given.frame_cur.image.shape[2:]
     size = fraction(height, width, scale)
     if size == (height, width):
         return given
 
-    def picked(plane: torch.Tensor) -> torch.Tensor:
+    def sampled(plane: torch.Tensor) -> torch.Tensor:
         return functional.interpolate(plane, size, mode="nearest")
 
     def frame(layers: LayerBatch) -> LayerBatch:
         coloured = {name: reduced(getattr(layers, name), *size) for name in ("image", "background_image")}
-        return layers._replace(
-            **coloured, **{n: picked(getattr(layers, n)) for n in layers._fields if n not in coloured}
-        )
+        others = {name: sampled(getattr(layers, name)) for name in layers._fields if name not in coloured}
+        return layers._replace(**coloured, **others)
 
     K = geometry.scale_intrinsics(given.K, size[1] / width, size[0] / height)
-    prior = given.prior._replace(
-        velocity_prev=picked(given.prior.velocity_prev), velocity_cur=picked(given.prior.velocity_cur)
-    )
-    own = None if given.own is None else picked(given.own)
+    before, now = sampled(given.prior.velocity_prev), sampled(given.prior.velocity_cur)
+    prior = given.prior._replace(velocity_prev=before, velocity_cur=now)
+    own = None if given.own is None else sampled(given.own)
     return NetworkInput(frame(given.frame_prev), frame(given.frame_cur), K, prior, own)
-
-
-def full(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    """A forecast image [B, 3, h, w] at the scene's own ``size``, values in [0, 1]."""
-    return enlarged(image, *size).clamp(0, 1)

@@ -2,13 +2,14 @@
 
 Each case runs twice on the same numbers, in float32 and in float64, forward and backward. The error of an array is
     max |a - b| / max |b|,   a in float32, b in float64:
-the maximum norm, over image or coverage (or displacement), and over the gradient of each input by itself. What is held
-against it is in vestcl.bench.stability.bounds, and what others make of the same case in vestcl.bench.stability.peers.
+the maximum norm, over image or coverage (or displacement), and over the gradient of each input separately. Its bounds
+are from vestcl.bench.stability.bounds, and the errors of others from vestcl.bench.stability.peers.
 """
 
 import contextlib
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,91 +18,44 @@ from rich.console import Console
 
 from vestcl import opencl
 from vestcl.bench.common import results as _results
-from vestcl.bench.common import timing as _timing
-from vestcl.bench.common.results import Measure, Results
-from vestcl.bench.stability import plots as _stability_plots
-from vestcl.bench.stability.bounds import UNIT, Bounds, bounds_of
+from vestcl.bench.common.options import Options
+from vestcl.bench.common.plots import Curve, curves, file_name
+from vestcl.bench.common.table import Measurement, Section
+from vestcl.bench.common.timing import Spread
+from vestcl.bench.stability.bounds import UNIT, bounds_of
 from vestcl.bench.stability.cases import FAMILIES, Case, Family
 from vestcl.bench.stability.peers import LEFT_OUT, peers_of
-from vestcl.bench.stability.programs import OPERATORS, Operators, Outcome, evaluate, relative_error
-from vestcl.evaluation.tables import Grid, to_rich
+from vestcl.bench.stability.programs import OPERATORS, Errors, evaluate, relative_errors
+
+Row = dict[str, Any]
+"""A case: "kept", "broken", "family", "knob", "errors", "bounds", and "peers" (errors by name)."""
 
 _NORM: Final = "Errors are max |float32 - float64| / max |float64| over each array; shown is the worst array's."
 
 NOTES: Final = {
     "dividing": "dividing: the same, in float32, by a backward that divides by 1 - alpha + 1e-9, as PyTorch3D's does.",
     "clamping": "clamping: alpha <= 0.99, T by division, as in 3D Gaussian Splatting; grad_backgrounds left out.",
-    "PyTorch3D": "PyTorch3D: its rasteriser and alpha compositor, without a background; grad_backgrounds left out.",
     "R x + t - x": "R x + t - x: the rigid flow as the difference that it is.",
 }
 
+_KINDS: Final = {"outputs": "output", "gradients": "gradient"}
+
+#: Errors below and above are drawn there: a tenth of float32's rounding, and neither a digit nor the size is right.
+_LIMITS: Final = (6e-9, 1e1)
+
 
 @dataclass(frozen=True)
-class StabilityBench:
-    """Hold float32 against float64, and against the bounds of its rounding errors, at extreme inputs."""
+class StabilityBench(Options):
+    """Compare float32 with float64, and with the bounds of its rounding errors, at extreme inputs."""
 
     families: tuple[str, ...] = ()
     """Which inputs go to their extremes (depth, layers, opacity, ...); without it all."""
     quick: bool = False
     """Fewer and smaller cases."""
     peers: bool = True
-    """Beside backwards that divide by 1 - alpha, and PyTorch3D where it is installed, too."""
+    """Compare with backwards that divide by 1 - alpha, and with a flow that subtracts, too."""
     seed: int = 0
-    """Of everything that is drawn."""
-    threads: int = 2
-    """Of torch."""
-    device: str | None = None
-    """OpenCL device: an index of `vestcl devices`, a part of its name, or all."""
-    json: Path | None = None
-    """File for the results."""
-    markdown: Path | None = None
-    """File for the tables."""
-    plots: Path | None = None
-    """Folder for a picture of each device's errors."""
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Relative errors in the maximum norm, by output and by input."""
-
-    outputs: dict[str, float]
-    gradients: dict[str, float]
-
-    @classmethod
-    def between(cls, got: Outcome, truth: Outcome) -> "Errors":
-        """Array by array."""
-        return cls(
-            {name: relative_error(got.outputs[name], of) for name, of in truth.outputs.items()},
-            {name: relative_error(got.gradients[name], of) for name, of in truth.gradients.items()},
-        )
-
-
-@dataclass(frozen=True)
-class Row:
-    """What came of one case."""
-
-    family: str
-    knob: float
-    errors: Errors
-    bounds: Bounds
-    peers: dict[str, Errors] = field(default_factory=dict)
-
-    @property
-    def broken(self) -> list[str]:
-        """Outputs, and gradients as "grad_NAME", whose error is above its bound."""
-        pairs = {name: (error, self.bounds.outputs[name]) for name, error in self.errors.outputs.items()}
-        pairs |= {f"grad_{name}": (error, self.bounds.gradients[name]) for name, error in self.errors.gradients.items()}
-        return [name for name, (error, bound) in pairs.items() if not error <= bound]
-
-    @property
-    def output(self) -> str:
-        """The output with the largest error."""
-        return max(self.errors.outputs, key=self.errors.outputs.__getitem__)
-
-    @property
-    def gradient(self) -> str:
-        """The input whose gradient has the largest error."""
-        return max(self.errors.gradients, key=self.errors.gradients.__getitem__)
+    """Of all random numbers."""
 
 
 def main(config: StabilityBench) -> int:
@@ -111,53 +65,38 @@ def main(config: StabilityBench) -> int:
         The exit status: 1 if a bound is broken, else 0.
 
     Raises:
-        ValueError: a family that isn't known, or a number of threads that is not positive.
+        ValueError: an unknown family, or a number of threads that is not positive.
         DeviceError: no such device, or none with float64 for the truth.
     """
-    families = _chosen(config)
-    console = _results.console()
-    rows: list[list[Row]] = []
-
-    def measure(session: opencl.Session) -> Results:
-        _results.show_machine(_results.describe(session), console)
-        with _timing.torch_threads(config.threads):
-            found = list(measure_rows(families, config, console))
-        result = report(session, config, found)
-        rows.append(found)
-        return result
-
-    results = _results.measure_each(config.device, measure, console)
-    _results.save(results, config.json, config.markdown)
-    if config.plots is not None:
-        for session_rows, result in zip(rows, results, strict=True):
-            path = _stability_plots.draw(session_rows, families, result.machine["device"], config.plots)
-            _results.tell_written(console, path)
-    broken = [f"{row.family} {row.knob:g}: {', '.join(row.broken)}" for of in rows for row in of if row.broken]
-    for line in broken:
-        console.print(f"[red]bound broken[/]: {line}", soft_wrap=True, highlight=False)
-    if not broken:
-        console.print(f"[green]all bounds kept[/] in {sum(map(len, rows))} cases", highlight=False)
-    return 1 if broken else 0
-
-
-def _chosen(config: StabilityBench) -> list[Family]:
     _results.check_positive(config, "threads")
     known = {family.name: family for family in FAMILIES}
     for name in config.families:
         if name not in known:
             raise ValueError(f"`families` must be of {', '.join(known)}, got {name}")
-    return [known[name] for name in config.families] or list(FAMILIES)
+    families = [known[name] for name in config.families] or list(FAMILIES)
+
+    def measure(_: opencl.Session, console: Console) -> Iterator[Section]:
+        for family in families:
+            yield section(
+                family, [_measured(case, config.peers, console) for case in family.cases(config.seed, config.quick)]
+            )
+
+    results = _results.run("stability", config, measure)
+    for number, result in enumerate(results):
+        if config.plots is not None:
+            draw(result.details["rows"], config.plots, f"{number} " if len(results) > 1 else "")
+    console, rows = _results.console(), [row for result in results for row in result.details["rows"]]
+    broken = [f"{row['family']} {row['knob']:g}: {', '.join(row['broken'])}" for row in rows if row["broken"]]
+    for line in broken:
+        console.print(f"[red]bound broken[/]: {line}", soft_wrap=True, highlight=False)
+    if not broken:
+        console.print(f"[green]all bounds kept[/] in {len(rows)} cases", highlight=False)
+    return 1 if broken else 0
 
 
-def measure_rows(families: list[Family], config: StabilityBench, console: Console) -> Iterator[Row]:
-    """Run all cases on the current device, and print each family's table."""
-    for family in families:
-        rows = []
-        for case in family.cases(config.seed, config.quick):
-            with console.status(case.name):
-                rows.append(measure_case(case, config.peers))
-        console.print(to_rich(grid(family, rows)))
-        yield from rows
+def _measured(case: Case, peers: bool, console: Console) -> Row:
+    with console.status(case.name):
+        return measure_case(case, peers)
 
 
 def measure_case(case: Case, peers: bool = True) -> Row:
@@ -165,16 +104,26 @@ def measure_case(case: Case, peers: bool = True) -> Row:
     with _float64():
         truth = evaluate(case, OPERATORS, torch.float64)
         bounds = bounds_of(case, truth)
-    errors = _errors(case, OPERATORS, truth)
-    others = {
-        name: _errors(case, of, truth, LEFT_OUT.get(name)) for name, of in (peers_of(case) if peers else {}).items()
-    }
-    return Row(case.family, case.knob, errors, bounds, others)
+    others = peers_of(case) if peers else {}
+    errors, *of_peers = (
+        relative_errors(evaluate(case, operators, torch.float32), truth) for operators in (OPERATORS, *others.values())
+    )
+    broken, peers_errors = broken_bounds(errors, bounds), dict(zip(others, of_peers, strict=True))
+    for name, left_out in LEFT_OUT.items():
+        peers_errors.get(name, {"gradients": {}})["gradients"].pop(left_out, None)
+    found = {"errors": errors, "bounds": bounds, "peers": peers_errors}
+    return {"kept": not broken, "broken": broken, "family": case.family, "knob": case.knob, **found}
 
 
-def _errors(case: Case, operators: Operators, truth: Outcome, left_out: str | None = None) -> Errors:
-    errors = Errors.between(evaluate(case, operators, torch.float32), truth)
-    return Errors(errors.outputs, {name: of for name, of in errors.gradients.items() if name != left_out})
+def broken_bounds(errors: Errors, bounds: Errors) -> list[str]:
+    """Outputs, and gradients as "grad_NAME", whose error is above its bound, or NaN."""
+    prefixes = {"outputs": "", "gradients": "grad_"}
+    return [
+        f"{prefixes[kind]}{name}"
+        for kind, arrays in errors.items()
+        for name, error in arrays.items()
+        if not error <= bounds[kind][name]
+    ]
 
 
 @contextlib.contextmanager
@@ -191,49 +140,67 @@ def _float64() -> Iterator[None]:
         yield
 
 
-# ---------------------------------------------------------------- report
+# ---------------------------------------------------------------- tables and plots
 
 
-def report(session: opencl.Session, config: StabilityBench, rows: list[Row]) -> Results:
-    """Of one device."""
-    measures = []
-    for row in rows:
-        for kind, value in (
-            ("output", row.errors.outputs[row.output]),
-            ("gradient", row.errors.gradients[row.gradient]),
-        ):
-            measures.append(Measure(f"{row.family} {row.knob:g}, {kind}", "1", value, value, value))
-    by_family = {family: [row for row in rows if row.family == family.name] for family in FAMILIES}
-    grids = [grid(family, own) for family, own in by_family.items() if own]
-    details = {"norm": _NORM, "unit_roundoff": UNIT, "rows": [_as_details(row) for row in rows]}
-    return Results("stability", _results.describe(session), _results.settings(config), measures, grids, details)
+def section(family: Family, rows: Sequence[Row]) -> Section:
+    """One family's table."""
+    cells = [cell for row in rows for cell in _cells(row)]
+    notes = (_NORM, *(NOTES[name] for name in dict.fromkeys(name for row in rows for name in row["peers"])))
+    details = {"norm": _NORM, "unit_roundoff": UNIT, "rows": list(rows)}
+    return Section(f"{family.name}: relative error of float32 over the {family.knob}", cells, notes, details)
 
 
-def _as_details(row: Row) -> dict[str, Any]:
-    return {"kept": not row.broken, "broken": row.broken, **vars(row)}
+def _cells(row: Row) -> Iterator[Measurement]:
+    knob = f"{row['knob']:.4g}"
+    for kind, label in _KINDS.items():
+        array = worst(row["errors"][kind])
+        name = f"{row['family']} {row['knob']:g}, {label}"
+        yield Measurement(knob, label, row["errors"][kind][array], digits=".1e", name=name)
+        if kind == "gradients":
+            yield Measurement(knob, "of", array)
+        yield Measurement(knob, f"{label} bound", row["bounds"][kind][array], digits=".1e")
+    yield Measurement(knob, "bounds", "broken" if row["broken"] else "kept")
+    for peer, errors in row["peers"].items():
+        for kind, label in _KINDS.items():
+            yield Measurement(knob, f"{peer} {label}", errors[kind][worst(errors[kind])], digits=".1e")
 
 
-def grid(family: Family, rows: list[Row]) -> Grid:
-    """The table of one family."""
-    names = list(dict.fromkeys(name for row in rows for name in row.peers))
-    peers = [f"{name} {kind}" for name in names for kind in ("output", "gradient")]
-    heading = ("", "output", "its bound", "gradient", "of", "its bound", "", *peers)
-    lines = []
-    for row in rows:
-        beside = [cell for name in names for cell in _peer_cells(row.peers.get(name))]
-        output, gradient = row.output, row.gradient
-        ours = (f"{row.knob:.4g}", _cell(row.errors.outputs[output]), _cell(row.bounds.outputs[output]))
-        back = (_cell(row.errors.gradients[gradient]), gradient, _cell(row.bounds.gradients[gradient]))
-        lines.append((*ours, *back, "broken" if row.broken else "kept", *beside))
-    notes = (_NORM, *(NOTES[name] for name in names))
-    return Grid(f"{family.name}: relative error of float32 over the {family.knob}", heading, tuple(lines), notes)
+def worst(errors: Mapping[str, float | None]) -> str:
+    """The array with the largest error; None is infinity, as JSON has it."""
+    return max(errors, key=lambda name: math.inf if (error := errors[name]) is None else error)
 
 
-def _peer_cells(errors: Errors | None) -> tuple[str, str]:
-    if errors is None:
-        return "-", "-"
-    return _cell(max(errors.outputs.values())), _cell(max(errors.gradients.values()))
+def draw(rows: Sequence[Mapping[str, Any]], folder: Path, prefix: str = "") -> None:
+    """Write a PNG a family: errors, bounds and peers over the knob; a knob of 0 is a tenth of the least other one.
+
+    Args:
+        rows: of the results' ``details["rows"]``.
+        folder: made where it does not exist.
+        prefix: of the files' names.
+
+    Raises:
+        ValueError: the folder can't be made.
+    """
+    for family in FAMILIES:
+        own = [row for row in rows if row["family"] == family.name]
+        zero = min((row["knob"] for row in own if row["knob"]), default=1.0) / 10
+        values: dict[str, list[Spread]] = {}
+        for row in own:
+            for kind, label in _KINDS.items():
+                array = worst(row["errors"][kind])
+                found = {"vestcl": row["errors"][kind][array], "bound": row["bounds"][kind][array]}
+                found |= {peer: errors[kind][worst(errors[kind])] for peer, errors in row["peers"].items()}
+                for name, error in found.items():
+                    values.setdefault(f"{name}, {label}", []).append(_spread(error))
+        if own:
+            knobs = [row["knob"] or zero for row in own]
+            lines = [Curve(name, knobs, of, dashed=not name.startswith("vestcl")) for name, of in values.items()]
+            title = f"{family.name}: relative error of float32 against float64, maximum norm"
+            curves(folder / file_name(f"{prefix}{family.name}"), title, family.knob, "relative error", lines)
 
 
-def _cell(value: float) -> str:
-    return f"{value:.1e}" if value else "0"
+def _spread(error: float | None) -> Spread:
+    """An error as it is drawn; None is infinity, as JSON has it."""
+    value = _LIMITS[1] if error is None else min(max(error, _LIMITS[0]), _LIMITS[1])
+    return Spread(value, value, value, 1)

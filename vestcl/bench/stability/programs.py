@@ -12,31 +12,27 @@ from vestcl.ops.rigid_flow import rigid_flow
 from vestcl.ops.splat import splat
 from vestcl.ops.unproject import unproject
 
+Outcome = dict[str, Inputs]
+"""What a program computes: "outputs" ("image" and "coverage", or "displacement_xyz") and "gradients" by input."""
+
+Errors = dict[str, dict[str, float]]
+"""A relative error for each array of an `Outcome`."""
+
 
 @dataclass(frozen=True)
 class Operators:
-    """What a program is made of; vestcl.ops, vestcl.reference and the peers fit alike."""
+    """The operators of a program: vestcl.ops, vestcl.reference and the peers have the same signatures."""
 
-    unproject: Callable[..., torch.Tensor]
-    rigid_flow: Callable[..., torch.Tensor]
-    displace: Callable[..., tuple[torch.Tensor, torch.Tensor]]
-    splat: Callable[..., tuple[torch.Tensor, torch.Tensor]]
+    unproject: Callable[..., torch.Tensor] = unproject
+    rigid_flow: Callable[..., torch.Tensor] = rigid_flow
+    displace: Callable[..., tuple[torch.Tensor, torch.Tensor]] = displace
+    splat: Callable[..., tuple[torch.Tensor, torch.Tensor]] = splat
     add: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] = torch.add
     """Of points and displacements."""
 
 
 #: vestcl's own.
-OPERATORS: Final = Operators(unproject, rigid_flow, displace, splat)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a program computes, by name, in the precision that it ran in."""
-
-    outputs: Inputs
-    """"image" and "coverage", or "displacement_xyz"."""
-    gradients: Inputs
-    """Of a random linear loss of the outputs, by input."""
+OPERATORS: Final = Operators()
 
 
 def evaluate(case: Case, operators: Operators, dtype: torch.dtype) -> Outcome:
@@ -48,28 +44,27 @@ def evaluate(case: Case, operators: Operators, dtype: torch.dtype) -> Outcome:
         dtype: float32 or float64.
 
     Returns:
-        Outputs, and gradients of the sum of outputs times `loss_weights`.
+        Outputs, and gradients of the sum of outputs times weights that are uniform in [-1, 1] and exact in float32.
     """
     inputs = {name: value.to(dtype) for name, value in case.inputs.items()}
     for name in case.differentiated:
         inputs[name].requires_grad_()
     outputs = _PROGRAMS[case.program](case, operators, inputs)
-    weights = loss_weights(case, {name: output.shape for name, output in outputs.items()})
+    generator = torch.Generator().manual_seed(case.seed)
     gradients = torch.autograd.grad(
         list(outputs.values()),
         [inputs[name] for name in case.differentiated],
-        [weights[name].to(dtype) for name in outputs],
+        [(2 * torch.rand(of.shape, generator=generator).double() - 1).to(dtype) for of in outputs.values()],
         allow_unused=True,
         materialize_grads=True,
     )
     values = {name: output.detach() for name, output in outputs.items()}
-    return Outcome(values, dict(zip(case.differentiated, gradients, strict=True)))
+    return {"outputs": values, "gradients": dict(zip(case.differentiated, gradients, strict=True))}
 
 
-def loss_weights(case: Case, shapes: dict[str, torch.Size]) -> Inputs:
-    """Uniform in [-1, 1], by output; float64, each a float32's."""
-    generator = torch.Generator().manual_seed(case.seed)
-    return {name: 2 * torch.rand(shape, generator=generator).double() - 1 for name, shape in shapes.items()}
+def relative_errors(got: Outcome, truth: Outcome) -> Errors:
+    """`relative_error` array by array."""
+    return {kind: {name: relative_error(got[kind][name], of) for name, of in truth[kind].items()} for kind in truth}
 
 
 def relative_error(got: torch.Tensor, wanted: torch.Tensor) -> float:
@@ -90,7 +85,10 @@ def relative_error(got: torch.Tensor, wanted: torch.Tensor) -> float:
 
 
 def _splat(case: Case, operators: Operators, inputs: Inputs) -> Inputs:
-    return _shown(case, operators, inputs, inputs["points_uv"], inputs["z"])
+    looks = (inputs[name] for name in ("radii", "opacities", "features"))
+    background = inputs["backgrounds"]
+    image, coverage = operators.splat(inputs["points_uv"], inputs["z"], *looks, case.height, case.width, background)
+    return {"image": image, "coverage": coverage}
 
 
 def _view(case: Case, operators: Operators, inputs: Inputs) -> Inputs:
@@ -101,19 +99,11 @@ def _view(case: Case, operators: Operators, inputs: Inputs) -> Inputs:
         points_xyz = operators.add(points_xyz, operators.rigid_flow(points_xyz, quaternion, translation))
     displacement_xyz = operators.rigid_flow(points_xyz, *steps[-1])
     points_uv, _ = operators.displace(points_xyz, displacement_xyz, inputs["K"], inputs["tgt_from_src"])
-    return _shown(case, operators, inputs, points_uv, inputs["depth"].detach().reshape(1, -1))
+    return _splat(case, operators, inputs | {"points_uv": points_uv, "z": inputs["depth"].detach().reshape(1, -1)})
 
 
 def _flow(case: Case, operators: Operators, inputs: Inputs) -> Inputs:
     return {"displacement_xyz": operators.rigid_flow(*(inputs[name] for name in case.differentiated))}
-
-
-def _shown(
-    case: Case, operators: Operators, inputs: Inputs, points_uv: torch.Tensor, z: torch.Tensor
-) -> dict[str, torch.Tensor]:
-    looks = (inputs[name] for name in ("radii", "opacities", "features"))
-    image, coverage = operators.splat(points_uv, z, *looks, case.height, case.width, inputs["backgrounds"])
-    return {"image": image, "coverage": coverage}
 
 
 _PROGRAMS: Final[dict[str, Callable[[Case, Operators, Inputs], dict[str, Any]]]] = {
