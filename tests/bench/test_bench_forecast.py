@@ -11,17 +11,19 @@ import torch
 from onnx_files import write_mix
 from st_lpips_weights import public_state
 
-from vestcl.bench.forecast import bench, tables, windows
-from vestcl.bench.forecast import run as running
+from vestcl.bench.forecast import bench
 from vestcl.bench.forecast import truth as known
 from vestcl.bench.forecast.bench import HELD_OUT, ForecastBench
-from vestcl.bench.forecast.windows import GEOMETRIC, ORACLE, SOURCE, TRUE_POSES, Prediction, Record, Truth
+from vestcl.bench.forecast.windows import chosen_windows, clips_of, groups_of
 from vestcl.cli import main as cli
 from vestcl.data import Street, street_clip
 from vestcl.data.calibration import invert
 from vestcl.data.sample import Clip, Sample
-from vestcl.evaluation import metrics, perceptual
+from vestcl.evaluation import metrics, perceptual, scores, tables
 from vestcl.evaluation.compare import FLOW, REPEAT
+from vestcl.evaluation.methods import TRUE_POSES
+from vestcl.evaluation.motion import ego_errors, true_motion
+from vestcl.evaluation.scores import GEOMETRIC, ORACLE, SOURCE, Prediction, Record, Truth
 from vestcl.evaluation.trunks.trunks import Trunk
 from vestcl.forecasting import peer
 from vestcl.forecasting.result import Forecast, Rendered, View
@@ -48,7 +50,7 @@ def rendered(image: np.ndarray, motion: np.ndarray | None = None, depth: np.ndar
 def true_forecast(clip: Clip, index: int, steps: int, offset: float = 0.0) -> Forecast:
     """What is true, its 3D motion ``offset`` metres wrong in every pixel."""
     shift = np.array([0, offset, 0], np.float32)[:, None, None]
-    motions = known.true_motion(clip, index, steps)
+    motions = true_motion(clip, index, steps)
     assert motions is not None
     frames = [
         {SOURCE: rendered(clip[index + k].read_image(), known.step_truth(clip, index + k) + shift)}
@@ -62,7 +64,7 @@ def true_forecast(clip: Clip, index: int, steps: int, offset: float = 0.0) -> Fo
 
 def test_true_motion_brings_a_point_of_the_world_from_camera_to_camera() -> None:
     clip = clip_of_street()
-    motions = known.true_motion(clip, 1, 3)
+    motions = true_motion(clip, 1, 3)
     assert motions is not None and len(motions) == 3
     point = np.array([1.0, -2.0, 30.0, 1.0])
     for step, motion in enumerate(motions, start=1):
@@ -74,7 +76,7 @@ def test_true_motion_brings_a_point_of_the_world_from_camera_to_camera() -> None
 
 def test_true_motion_needs_every_pose() -> None:
     bare = Sample.from_arrays("0", np.zeros((3, 8, 8)), np.eye(3))
-    assert known.true_motion(Clip("bare", "arrays", (bare, bare)), 0, 1) is None
+    assert true_motion(Clip("bare", "arrays", (bare, bare)), 0, 1) is None
 
 
 def test_step_truth_is_the_cameras_motion_where_nothing_moves() -> None:
@@ -118,7 +120,7 @@ def test_ego_errors_by_hand() -> None:
     estimate = truth.copy()
     estimate[0, 3] = 0.1
     stands = np.eye(4)
-    errors = known.ego_errors(Forecast("", [estimate, stands], []), [truth, stands])
+    errors = ego_errors(Forecast("", [estimate, stands], []), [truth, stands])
     assert errors["translation_percent"][0] == pytest.approx(5.0)
     assert np.isnan(errors["translation_percent"][1]) and errors["rotation_deg"] == [0.0, 0.0]
 
@@ -151,7 +153,7 @@ def test_scores_of_known_errors() -> None:
     off = [image + np.float32(26 / 255) for image in grey]
     predictions = {SOURCE: {"off": Prediction(off, 1.5), "equal": Prediction(grey, 0.0)}}
     forecast = Forecast("", [], [{SOURCE: rendered(image)} for image in off])
-    bad, good = windows.score(truth, 0, [SOURCE_VIEW], predictions, forecast)
+    bad, good = scores.score(truth, 0, [SOURCE_VIEW], predictions, forecast)
     assert (bad.method, bad.view, bad.index, bad.seconds) == ("off", SOURCE, 0, 1.5)
     np.testing.assert_allclose(bad.scores["psnr"], -20 * np.log10(26 / 255), atol=1e-3)
     np.testing.assert_allclose(bad.scores["psnr_seen"], bad.scores["psnr"], atol=1e-4)
@@ -163,10 +165,10 @@ def test_the_distance_of_kept_maps_is_the_squeeze_distance() -> None:
     torch.manual_seed(0)
     trunk = Trunk("squeezenet1_0").requires_grad_(False).eval()
     pictures = [np.random.default_rng(seed).random((3, *SIZE)).astype(np.float32) for seed in (0, 1)]
-    first, second = windows.look(pictures, SIZE, trunk)
+    first, second = scores.look(pictures, SIZE, trunk)
     batch = [metrics.quantise(torch.from_numpy(picture)[None]) for picture in pictures]
     wanted = perceptual.squeeze_distance(batch[0], batch[1], trunk)
-    torch.testing.assert_close(windows._distance(first.maps, second.maps), wanted, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(scores.distance(first.maps, second.maps), wanted, rtol=1e-4, atol=1e-6)
 
 
 def record(method: str, index: int, psnr: list[float], view: str = SOURCE) -> Record:
@@ -175,7 +177,7 @@ def record(method: str, index: int, psnr: list[float], view: str = SOURCE) -> Re
 
 def test_means_by_hand() -> None:
     records = [record("a", 1, [10.0, 20.0]), record("a", 2, [14.0, np.nan]), record("b", 1, [np.nan, np.nan])]
-    told = tables.summary(records, [])["views"][SOURCE]
+    told = tables.summarise(records)[SOURCE]
     assert told["a"]["windows"] == 2 and told["a"]["seconds"] == 3.0
     assert told["a"]["by_horizon"] == {"psnr": [12.0, 20.0]}
     assert told["a"]["running_mean"]["psnr"] == pytest.approx([12.0, 16.0])
@@ -191,7 +193,7 @@ def test_tables_by_hand() -> None:
     assert grid.title == "clip, view source, mean over 2 windows"
     lines = tables.to_markdown(grid).splitlines()
     assert lines[2:5] == ["|  | PSNR t+2 | s |", "| --- | ---: | ---: |", "| a | 25.00 | 3.00 |"]
-    assert tables.fact_grids("clip", [], (1,)) == []
+    assert bench.fact_grids("clip", [], (1,)) == []
 
 
 # ---------------------------------------------------------------- whole runs
@@ -199,17 +201,17 @@ def test_tables_by_hand() -> None:
 
 def test_windows_have_a_frame_before_and_steps_after() -> None:
     clip = clip_of_street(frames=6)
-    assert list(running.windows_of(clip, ForecastBench(("x",), steps=2))) == [1, 2, 3]
-    assert list(running.windows_of(clip, ForecastBench(("x",), steps=1, first=2, every=2))) == [2, 4]
-    assert list(running.windows_of(clip, ForecastBench(("x",), steps=1, last=2))) == [1, 2]
+    assert list(chosen_windows(clip, ForecastBench(("x",), steps=2))) == [1, 2, 3]
+    assert list(chosen_windows(clip, ForecastBench(("x",), steps=1, first=2, every=2))) == [2, 4]
+    assert list(chosen_windows(clip, ForecastBench(("x",), steps=1, last=2))) == [1, 2]
 
 
 def test_inputs() -> None:
     config = ForecastBench(("x",), **TINY)
-    names = [clip.name for clip in running.clips_of("street:4-6", config)]
+    names = [clip.name for clip in clips_of("street:4-6", config)]
     assert names == ["street 4", "street 5", "street 6"]
-    assert [clip.name for clip in running.clips_of("street:7", config)] == ["street 7"]
-    assert [clip.name for clip in running.clips_of("street:", config)] == [f"street {seed}" for seed in HELD_OUT]
+    assert [clip.name for clip in clips_of("street:7", config)] == ["street 7"]
+    assert [clip.name for clip in clips_of("street:", config)] == [f"street {seed}" for seed in HELD_OUT]
 
 
 @pytest.mark.parametrize(
@@ -264,14 +266,14 @@ def test_the_command_line_reaches_it(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_pooled_inputs_share_a_table() -> None:
     config = ForecastBench(("street:4", "street:5"), **TINY, pool=True)
-    (group,) = running.groups_of(config)
+    (group,) = groups_of(config)
     assert [clip.name for clip, _ in group.clips] == ["street 4", "street 5"]
 
 
 def test_a_network_gives_depth(tmp_path: Path) -> None:
     network = write_mix(tmp_path / "network.onnx", [[0.0] * 3], bias=[7.0], metres=1)
     config = ForecastBench(("street:1100",), street_size=(48, 96), street_frames=4, depth_model=str(network), steps=1)
-    ((clip, chosen),) = running.groups_of(config)[0].clips
+    ((clip, chosen),) = groups_of(config)[0].clips
     assert chosen == [1, 2] and np.allclose(clip[1].read_depth(), 7, rtol=1e-5)
     with pytest.raises(ValueError, match=r"nothing\.onnx"):
-        running.groups_of(dataclasses.replace(config, depth_model=str(tmp_path / "nothing.onnx")))
+        groups_of(dataclasses.replace(config, depth_model=str(tmp_path / "nothing.onnx")))

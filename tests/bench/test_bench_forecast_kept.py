@@ -12,7 +12,7 @@ from vestcl.bench.forecast import run as running
 from vestcl.bench.forecast.bench import ForecastBench
 from vestcl.bench.forecast.kept import SUFFIX, Kept
 from vestcl.bench.forecast.truth import Facts
-from vestcl.bench.forecast.windows_list import evenly, read_list
+from vestcl.bench.forecast.windows import groups_of, read_list
 from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip, Sample
 from vestcl.evaluation.regions import REGIONS, error_shares
@@ -68,19 +68,19 @@ def test_a_torn_line_costs_one_window(tmp_path: Path, cut: int) -> None:
 def test_a_stopped_run_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, measured = tmp_path / "scores.json", []
     config = ForecastBench(("street:4",), **TINY, out=out)
-    whole = running.windows.predict
+    whole = running.forecasts_of
 
     def stops(*args: Any) -> Any:
-        if args[2] == 3:
+        if args[1] == 3:
             raise KeyboardInterrupt
-        measured.append(args[2])
+        measured.append(args[1])
         return whole(*args)
 
-    monkeypatch.setattr(running.windows, "predict", stops)
+    monkeypatch.setattr(running, "forecasts_of", stops)
     with pytest.raises(KeyboardInterrupt):
         bench.main(config)
     assert measured == [1, 2] and not out.exists()
-    monkeypatch.setattr(running.windows, "predict", lambda *args: measured.append(args[2]) or whole(*args))
+    monkeypatch.setattr(running, "forecasts_of", lambda *args: measured.append(args[1]) or whole(*args))
     bench.main(config)
     assert measured == [1, 2, 3]
     (told,) = json.loads(out.read_text(encoding="utf-8"))["inputs"]
@@ -89,12 +89,6 @@ def test_a_stopped_run_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 # ---------------------------------------------------------------- lists of windows
-
-
-def test_even_windows() -> None:
-    assert evenly([1, 2, 3], 5) == [1, 2, 3]
-    assert evenly(range(1, 100), 4) == [1, 34, 66, 99]
-    assert evenly([5, 6], 1) == [5]
 
 
 def listed(tmp_path: Path, content: object) -> Path:
@@ -106,7 +100,7 @@ def listed(tmp_path: Path, content: object) -> Path:
 def test_listed_windows_are_measured(tmp_path: Path) -> None:
     path = listed(tmp_path, {"street 4": {"use": "checked", "frames": [3, 1]}})
     config = ForecastBench(("street:4",), **TINY, windows=path)
-    (group,) = running.groups_of(config)
+    (group,) = groups_of(config)
     assert group.clips[0][1] == [1, 3] and group.use == "checked"
 
 
@@ -123,7 +117,7 @@ def test_listed_windows_are_measured(tmp_path: Path) -> None:
 )
 def test_wrong_lists(tmp_path: Path, content: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        running.groups_of(ForecastBench(("street:4",), **TINY, windows=listed(tmp_path, content)))
+        groups_of(ForecastBench(("street:4",), **TINY, windows=listed(tmp_path, content)))
 
 
 @pytest.mark.parametrize(

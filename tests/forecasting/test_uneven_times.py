@@ -13,7 +13,7 @@ from video_files import write_video
 
 from train.data.windows import WindowSet
 from vestcl.bench.forecast import bench
-from vestcl.bench.forecast import run as running
+from vestcl.bench.forecast.windows import chosen_windows
 from vestcl.cli import main as cli
 from vestcl.data import Street, street_clip
 from vestcl.data.calibration import power
@@ -206,7 +206,7 @@ def test_truth_is_the_frame_at_that_time() -> None:
 
 def test_windows_with_a_gap_are_left_out(tmp_path: Path) -> None:
     clip = uneven()
-    assert running.windows_of(clip, bench.ForecastBench(("x",), steps=2)) == [4, 7, 8]
+    assert chosen_windows(clip, bench.ForecastBench(("x",), steps=2)) == [4, 7, 8]
     small = clip.resized(24, 80)
     prepare_clip(small, tmp_path)
     cache = PreparedClip.open(tmp_path)

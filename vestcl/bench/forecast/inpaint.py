@@ -1,22 +1,23 @@
-"""`vestcl bench inpaint`: what each method makes of the background, against the street without its foreground.
+"""`vestcl bench inpaint`: the background by each method, against the street without its foreground.
 
 With clips: what forecasts show where no pixel of frames t and t-1 is, with and without a memory.
 """
 
 import time
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd  # type: ignore[import-untyped]
 from numpy.typing import NDArray
-from rich import box
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from vestcl import opencl
-from vestcl.bench.common.results import describe, write_json
+from vestcl.bench.common.options import JsonOption
+from vestcl.bench.common.results import console as make_console
+from vestcl.bench.common.results import describe, plain, write_json
+from vestcl.bench.common.table import Measurement, Section, show_grid
 from vestcl.bench.forecast import open_pixels
 from vestcl.constants import SKY_DEPTH
 from vestcl.data import Street, intrinsics
@@ -34,11 +35,17 @@ FIRST_SEED: Final = 2000
 #: A depth is right within that share.
 _RIGHT: Final = 0.1
 
-Scores = dict[str, float]
+#: Score -> its column, the factor to that, and digits.
+_COLUMNS: Final = {
+    "psnr": ("PSNR, dB", 1, ".2f"),
+    "depth_median": ("depth, median error, %", 100, ".1f"),
+    "depth_right": ("depth within 10 %, %", 100, ".0f"),
+    "seconds": ("time, s", 1, ".2f"),
+}
 
 
 @dataclass(frozen=True)
-class InpaintBench:
+class InpaintBench(JsonOption):
     """Fill in behind the foreground of procedural streets, and compare with what is there."""
 
     streets: int = 20
@@ -59,8 +66,6 @@ class InpaintBench:
     """Measure ST-LPIPS on clips, by the weights FILE or those inside an installed stlpips-pytorch."""
     device: str | None = None
     """OpenCL device that renders."""
-    json: Path | None = None
-    """File for the figures."""
 
     def __post_init__(self) -> None:
         if self.streets < 1:
@@ -72,35 +77,41 @@ class InpaintBench:
 
 
 def main(config: InpaintBench) -> None:
-    """Measure and print the table."""
-    console = Console()
-    with opencl.use(config.device):
-        about = describe(opencl.current())
-        if config.clips:
-            _measure_clips(config, about, console)
-            return
-        scores: dict[str, list[Scores]] = {method: [] for method in config.methods}
-        for seed in track(range(FIRST_SEED, FIRST_SEED + config.streets), "streets", console=console, transient=True):
-            frame = street(seed, config.height, config.width)
-            for method in config.methods:
-                scores[method].append(score(method, *frame))
-    means = {method: _mean(rows) for method, rows in scores.items()}
-    console.print(_table(means, config))
+    """Measure and print the tables."""
+    console = make_console()
+    with opencl.use(config.device) as session:
+        content = {"about": describe(session)} | (_on_clips if config.clips else _on_streets)(config, console)
     if config.json is not None:
-        write_json(config.json, {"about": about, "streets": config.streets, "means": means, "scores": scores})
+        write_json(config.json, plain(content))
 
 
-def _measure_clips(config: InpaintBench, about: dict[str, str], console: Console) -> None:
+def _on_streets(config: InpaintBench, console: Console) -> dict[str, Any]:
+    scores: dict[str, list[dict[str, float]]] = {method: [] for method in config.methods}
+    for seed in track(range(FIRST_SEED, FIRST_SEED + config.streets), "streets", console=console, transient=True):
+        frame = street(seed, config.height, config.width)
+        for method in config.methods:
+            scores[method].append(score(method, *frame))
+    means = {method: pd.DataFrame(of).mean().to_dict() for method, of in scores.items()}
+    rows = [
+        Measurement(f"{method} (default)" if method == DEFAULT else method, column, mean[name] * factor, digits=digits)
+        for method, mean in sorted(means.items(), key=lambda item: -item[1]["psnr"])
+        for name, (column, factor, digits) in _COLUMNS.items()
+    ]
+    title = f"behind the foreground of {config.streets} streets, {config.height} x {config.width}, by method"
+    show_grid(Section(title, rows).grid(), console)
+    return {"streets": config.streets, "means": means, "scores": scores}
+
+
+def _on_clips(config: InpaintBench, console: Console) -> dict[str, Any]:
     distance = None if config.st_lpips is None else StLpips.load(config.st_lpips)
-    scores: list[open_pixels.OpenScore] = []
+    scores = list[dict[str, Any]]()
     for name in config.clips:
         clip = open_sequence(name).resized(config.height, config.width)
         indices = open_pixels.windows_of(clip, config.windows, config.memory)
         found = list(open_pixels.measure(clip, indices, config.memory, distance))
-        console.print(open_pixels.table_of(found, f"{clip.name}, {len(indices)} windows"))
+        show_grid(open_pixels.section(found, f"{clip.name}, {len(indices)} windows").grid(), console)
         scores += found
-    if config.json is not None:
-        write_json(config.json, {"about": about, "scores": [asdict(one) for one in scores]})
+    return {"scores": scores}
 
 
 def street(seed: int, height: int, width: int) -> tuple[NDArray[Any], ...]:
@@ -121,7 +132,7 @@ def score(
     mask: NDArray[np.bool_],
     true_image: NDArray[np.float32],
     true_depth: NDArray[np.float32],
-) -> Scores:
+) -> dict[str, float]:
     """PSNR dB of the colour, median and share within 10 % of the depth, where M = 0; seconds."""
     start = time.perf_counter()
     filled, filled_depth = inpaint_background(image, depth, mask, method=method)
@@ -134,17 +145,3 @@ def score(
         "depth_right": float((off < _RIGHT).mean()),
         "seconds": seconds,
     }
-
-
-def _mean(rows: list[Scores]) -> Scores:
-    return {name: float(np.mean([scores[name] for scores in rows])) for name in rows[0]}
-
-
-def _table(means: dict[str, Scores], config: InpaintBench) -> Table:
-    title = f"behind the foreground of {config.streets} streets, {config.height} x {config.width}"
-    table = Table("method", "PSNR", "depth, median error", "depth within 10 %", "time", box=box.SIMPLE, title=title)
-    for method, mean in sorted(means.items(), key=lambda item: -item[1]["psnr"]):
-        name = f"{method} (default)" if method == DEFAULT else method
-        cells = f"{mean['psnr']:.2f} dB", f"{mean['depth_median']:.1%}", f"{mean['depth_right']:.0%}"
-        table.add_row(name, *cells, f"{mean['seconds']:.2f} s")
-    return table

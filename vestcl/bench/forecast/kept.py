@@ -6,7 +6,7 @@ The first line is a key of all that the scores depend on: the settings and the p
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ from vestcl.evaluation.scores import Record
 
 Window = tuple[list[Record], list[Facts]]
 
-#: The file beside OUT, until OUT is written.
+#: The file next to OUT, until OUT is written.
 SUFFIX: Final = ".windows.jsonl"
 
 
@@ -25,7 +25,7 @@ class Kept:
 
     Args:
         path: of the file; None keeps nothing.
-        settings: what scores depend on, besides the source code.
+        settings: what scores depend on, next to the source code.
 
     Raises:
         ValueError: the file can't be read or written.
@@ -51,7 +51,8 @@ class Kept:
         self._windows[clip, index] = window
         if self.path is None:
             return
-        line = {"clip": clip, "index": index, "records": _plain(window[0]), "facts": _plain(window[1])}
+        records, facts = ([dataclasses.asdict(one) for one in part] for part in window)
+        line = {"clip": clip, "index": index, "records": records, "facts": facts}
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             is_new = len(self._windows) == 1 or not self.path.exists()
@@ -83,7 +84,7 @@ def _read(path: Path, key: str) -> dict[tuple[str, int], Window]:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
     except OSError as error:
         raise ValueError(f"{path}: can't be read: {error.strerror}") from error
-    entries = [entry for entry in map(_entry, lines) if entry is not None]
+    entries = [entry for entry in map(_entry, lines) if isinstance(entry, dict)]
     if not entries or entries[0].get("key") != key:
         return {}
     try:
@@ -92,17 +93,12 @@ def _read(path: Path, key: str) -> dict[tuple[str, int], Window]:
         raise ValueError(f"{path}: holds no scores ({error}); delete it to measure them again") from error
 
 
-def _entry(line: str) -> dict[str, Any] | None:
+def _entry(line: str) -> Any:
     try:
-        entry = json.loads(line)
+        return json.loads(line)
     except (ValueError, RecursionError):
         return None
-    return entry if isinstance(entry, dict) else None
 
 
 def _window(entry: Mapping[str, Any]) -> Window:
     return [Record(**each) for each in entry["records"]], [Facts(**each) for each in entry["facts"]]
-
-
-def _plain(each: Sequence[Record] | Sequence[Facts]) -> list[dict[str, Any]]:
-    return [dataclasses.asdict(one) for one in each]

@@ -1,7 +1,4 @@
-"""What `vestcl bench forecast` knows beside pictures: true camera motion, true 3D motion, the splatter on true scenes.
-
-Camera motion is known where a clip has poses; the rest of procedural streets alone.
-"""
+"""What `vestcl bench forecast` knows of streets besides images: true 3D motion, and the splatter on true scenes."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -15,20 +12,17 @@ from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.street.clip import Shot, StreetImage
 from vestcl.evaluation import metrics
-from vestcl.evaluation.motion import ego_errors, true_motion
 from vestcl.forecasting.geometric.render import FrameCloud, show
 from vestcl.forecasting.result import Forecast
 from vestcl.io.labels import SKY, background
 
-__all__ = ["Facts", "ego_errors", "motion_errors", "shot", "splatter_alone", "step_truth", "true_motion"]
-
-#: A thing that moves by less than that by itself from frame to frame (metres) stands.
+#: An object that moves by less than that in the world from frame to frame (metres) is static.
 STILL: Final = 0.01
 
 #: A point is seen where the depth map, interpolated as 1 / depth, is not nearer than the point by a larger factor.
 _HIDDEN: Final = 1.03
 
-#: Points nearer than that (metres) are not in the picture, and not divided by.
+#: Points nearer than that (metres) are not in the image, and not divided by.
 _NEAREST: Final = 0.1
 
 Array = NDArray[np.float64]
@@ -36,7 +30,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Facts:
-    """Errors of one window's forecast other than in pictures."""
+    """Errors of one window's forecast other than in images."""
 
     clip: str
     frame: str
@@ -70,7 +64,7 @@ def step_truth(clip: Clip, index: int) -> NDArray[np.float32]:
 
 
 def motion_errors(forecast: Forecast, clip: Clip, index: int, view: str) -> dict[str, list[float]]:
-    """Mean |motion_xyz - truth| over the pixels of t + k that are not sky and that the forecast shows something at.
+    """Mean |motion_xyz - truth| over the pixels of t + k that are not sky and that the forecast covers.
 
     Args:
         forecast: of a street, at the street's own size.
@@ -79,20 +73,21 @@ def motion_errors(forecast: Forecast, clip: Clip, index: int, view: str) -> dict
         view: name of the source view in ``forecast``.
 
     Returns:
-        "motion_m" over all of these pixels, "moving_m" over those of them that show what moves by itself, by STILL or
-        more (NaN without any), and "motion_known", their share of all pixels that are not sky.
+        "motion_m" over all of these pixels, "moving_m" over those of them that show dynamic objects, by STILL or more
+        (NaN without any), and "motion_known", their share of all pixels that are not sky.
     """
     errors: dict[str, list[float]] = {"motion_m": [], "moving_m": [], "motion_known": []}
     for step, frame in enumerate(forecast.frames, start=1):
         after, before = clip[index + step], clip[index + step - 1]
-        truth = step_truth(clip, index + step)
+        truth, points = step_truth(clip, index + step), _points(after)
         solid = after.read_labels() != SKY
         known = solid & (frame[view].depth > 0)
-        own = np.linalg.norm(truth + _rigid_step(after, before), axis=0)[None] > STILL
-        missed, wanted = (torch.from_numpy(each.reshape(1, 3, -1)).mT for each in (frame[view].motion_xyz, truth))
-        for name, mask in (("motion_m", known), ("moving_m", known & own)):
+        rigid_step = _rigid(after, before, points, ~solid) - points
+        dynamic = np.linalg.norm(truth + rigid_step, axis=0)[None] > STILL
+        made, wanted = (torch.from_numpy(each.reshape(1, 3, -1)).mT for each in (frame[view].motion_xyz, truth))
+        for name, mask in (("motion_m", known), ("moving_m", known & dynamic)):
             inside = torch.from_numpy(mask.reshape(1, -1))
-            errors[name].append(float(metrics.end_point_error(missed, wanted, inside)))
+            errors[name].append(float(metrics.end_point_error(made, wanted, inside)))
         errors["motion_known"].append(float(known.sum() / max(solid.sum(), 1)))
     return errors
 
@@ -100,10 +95,10 @@ def motion_errors(forecast: Forecast, clip: Clip, index: int, view: str) -> dict
 def splatter_alone(clip: Clip, index: int) -> dict[str, list[float]]:
     """PSNR of t + 1 splatted from t with everything true, and warped back from t with everything true.
 
-    - Splatted: depth and `Street.motion` of t, with what stands behind the foreground from a picture without it.
+    - Splatted: depth and `Street.motion` of t, with the background behind the foreground from an image without it.
     - Warped: I(p) = I_t(project(x + u)) with depth x and motion u from t + 1 back to t, bilinear.
 
-    Both over the pixels of t + 1 whose point is in the picture at t and not hidden there by something nearer.
+    Both over the pixels of t + 1 whose point is in the image at t and not hidden there by something nearer.
 
     Args:
         clip: of a street, at the street's own size.
@@ -117,31 +112,33 @@ def splatter_alone(clip: Clip, index: int) -> dict[str, list[float]]:
         ValueError: the clip is of no street.
     """
     cur, after = clip[index], clip[index + 1]
-    image, depth = cur.read_image(), cur.read_depth()
+    image = cur.read_image()
     origin = _points(after) + _motion(after, cur)
     projected = np.einsum("ij,jhw->ihw", cur.K, origin)
     uv = (projected[:2] / np.maximum(projected[2], _NEAREST)).astype(np.float32)
     inside = (origin[2] > _NEAREST) & (uv > 0).all(0) & (uv[0] < cur.width) & (uv[1] < cur.height)
-    hidden = origin[2] * _sample(np.float32(1) / depth, uv)[0] > _HIDDEN
+    hidden = origin[2] * _sample(np.float32(1) / cur.read_depth(), uv)[0] > _HIDDEN
     splatted = show(_true_clouds(cur, after), after.K, np.eye(4), after.height, after.width).planes[:3]
     mask = torch.from_numpy(inside & ~hidden)[None, None]
-    truth = _eight_bit(after.read_image())
-    splat_db, warp_db = (float(metrics.psnr(_eight_bit(made), truth, mask)) for made in (splatted, _sample(image, uv)))
-    values = {"splatted_db": splat_db, "warped_db": warp_db, "splatter_loss_db": warp_db - splat_db}
-    return {name: [value] for name, value in (values | {"seen": float(mask.double().mean())}).items()}
+    truth, *made = (
+        metrics.quantise(torch.from_numpy(np.ascontiguousarray(each))[None])
+        for each in (after.read_image(), splatted, _sample(image, uv))
+    )
+    splat_db, warp_db = (float(metrics.psnr(each, truth, mask)) for each in made)
+    seen = float(mask.double().mean())
+    return {"splatted_db": [splat_db], "warped_db": [warp_db], "splatter_loss_db": [warp_db - splat_db], "seen": [seen]}
 
 
 def _true_clouds(cur: Sample, after: Sample) -> list[FrameCloud]:
-    """What the frame shows, and what stands behind its foreground, where they are one frame on."""
-    taken = _taken(cur)
+    """The frame's pixels, and the background behind its foreground, one frame later."""
+    taken, points = _taken(cur), _points(cur)
     behind = Shot(taken.street, taken.t, taken.aside, taken.size, taken.samples, foreground=False).take()
-    points, moved = _points(cur), _points(cur) + _motion(cur, after)
-    all_of_it = np.ones((cur.height, cur.width), bool)
+    background_points = _lift(behind.depth[0], cur.K)
     hidden = ~background(cur.read_labels())[0]
-    rigid = _rigid(cur, after, _lift(behind.depth[0], cur.K), behind.labels[0] == SKY)
+    moved = _rigid(cur, after, background_points, behind.labels[0] == SKY)
     return [
-        _cloud(cur.read_image(), points, moved, all_of_it),
-        _cloud(behind.colour[0], _lift(behind.depth[0], cur.K), rigid, hidden),
+        _cloud(cur.read_image(), points, points + _motion(cur, after), np.ones_like(hidden)),
+        _cloud(behind.colour[0], background_points, moved, hidden),
     ]
 
 
@@ -160,17 +157,11 @@ def _motion(cur: Sample, after: Sample) -> NDArray[np.float32]:
     return start.street.motion(cur_from_world, after_from_world, cur.K, cur.height, cur.width, start.t, end.t)
 
 
-def _rigid_step(cur: Sample, after: Sample) -> Array:
-    """What `_motion` would be if nothing moved but the camera."""
-    points = _points(cur)
-    return _rigid(cur, after, points, cur.read_labels() == SKY) - points
-
-
 def _rigid(cur: Sample, after: Sample, points: Array, sky: NDArray[np.bool_]) -> Array:
-    """``points`` [3, H, W] m in the camera of ``after``; the sky [1, H, W] only turns."""
+    """Static ``points`` [3, H, W] m in the camera of ``after``; the sky [1, H, W] only rotates."""
     after_from_cur = calibration.invert(_pose(after)) @ _pose(cur)
-    turned = np.einsum("ij,jhw->ihw", after_from_cur[:3, :3], points)
-    return turned + np.where(sky, 0.0, after_from_cur[:3, 3, None, None])
+    rotated = np.einsum("ij,jhw->ihw", after_from_cur[:3, :3], points)
+    return rotated + np.where(sky, 0.0, after_from_cur[:3, 3, None, None])
 
 
 def _points(sample: Sample) -> Array:
@@ -187,10 +178,6 @@ def _sample(planes: NDArray[np.float32], uv: NDArray[np.float32]) -> NDArray[np.
     """``planes`` [C, H, W] at ``uv`` [2, H, W] px, bilinear; the border is repeated."""
     u, v = uv - np.float32(0.5)  # OpenCV counts from pixel centres
     return np.stack([cv2.remap(plane, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in planes])
-
-
-def _eight_bit(image: NDArray[np.float32]) -> torch.Tensor:
-    return metrics.quantise(torch.from_numpy(np.ascontiguousarray(image))[None])
 
 
 def _taken(sample: Sample) -> Shot:
