@@ -1,25 +1,31 @@
 """`vestcl bench camera`: a camera's forecast motion against pose files, by time ahead, bends and straights apart."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from rich import box
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
-from vestcl.bench.common.results import plain, settings, write_json
+from vestcl.bench.common.options import JsonOption
+from vestcl.bench.common.results import console, plain, settings, write_json
+from vestcl.bench.common.table import Measurement, Section, show_grid
 from vestcl.data.readers.trajectories import KITTI_FPS, read_trajectory
 from vestcl.scene.motion.camera_forecast import CameraForecaster
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+
+#: Errors as tables show them.
+_COLUMNS: Final = (("rotation_deg", "rotation (deg)", ".3f"), ("translation_percent", "translation (%)", ".2f"))
+
+Errors = dict[str, dict[str, dict[str, Any]]]
+"""By part of a drive ("all", "bends", "straights") and method ("forecast", "constant velocity"): "rotation_deg",
+"translation_percent" (standstill left out) and the number of "frames"."""
 
 #: Motions before the first forecast that is scored.
 _FIRST: Final = 16
@@ -29,17 +35,8 @@ BEND: Final = 10.0
 STANDSTILL: Final = 1.0
 
 
-class Errors(NamedTuple):
-    """Mean errors of the forecasts of one time ahead, and how many forecasts they are of."""
-
-    rotation_deg: float
-    translation_percent: float
-    """Of the path; standstill left out."""
-    frames: int
-
-
 @dataclass(frozen=True)
-class CameraBench:
+class CameraBench(JsonOption):
     """Forecast the camera of recorded drives, and compare with where it went.
 
     Motions are measured with noise. The peer is constant velocity: yaw and translation of the last two motions' mean.
@@ -59,8 +56,6 @@ class CameraBench:
     """Standard deviation of the measured lengths, as a share."""
     seeds: int = 20
     """Of the noise; errors are means over them."""
-    json: Path | None = None
-    """File for the figures."""
 
     def __post_init__(self) -> None:
         if not self.files or self.seeds < 1 or not self.ahead or min(self.ahead) <= 0:
@@ -74,22 +69,30 @@ class CameraBench:
 
 def main(config: CameraBench) -> None:
     """Measure and print a table for each file."""
-    console, results = Console(), dict[str, Any]()
+    results, screen = dict[str, Any](), console()
     for path in config.files:
         drive = read_trajectory(path, config.fps)
         interval = float(np.median(np.diff(drive.seconds)))
         steps = sorted({max(1, round(seconds / interval)) for seconds in config.ahead})
-        scores = evaluate(drive.world_from_cam, drive.seconds, steps, config)
-        console.print(_table(path, scores, steps, interval))
-        results[str(path)] = {f"{step * interval:g} s": _as_dicts(scores[step]) for step in steps}
+        found = evaluate(drive.world_from_cam, drive.seconds, steps, config)
+        rows = [row for step in steps for row in _rows(f"{step * interval:.2f} s", found[step])]
+        show_grid(Section(path.name, rows, ("ratio: to constant velocity",)).grid(), screen)
+        results[str(path)] = {f"{step * interval:g} s": found[step] for step in steps}
     if config.json is not None:
         write_json(config.json, plain({"config": settings(config), "errors": results}))
 
 
-def evaluate(
-    world_from_cam: Array, seconds: Array, steps: Sequence[int], config: CameraBench
-) -> dict[int, dict[str, dict[str, Errors]]]:
-    """Errors by step, by part of the drive ("all", "bends", "straights"), by method ("forecast", "constant velocity").
+def _rows(ahead: str, parts: Errors) -> Iterator[Measurement]:
+    for part, methods in parts.items():
+        ours, constant, row = methods["forecast"], methods["constant velocity"], f"{ahead}, {part}"
+        yield Measurement(row, "frames", str(ours["frames"]))
+        for name, column, digits in _COLUMNS:
+            yield Measurement(row, column, ours[name], digits=digits)
+            yield Measurement(row, f"{column.split()[0]} ratio", ours[name] / constant[name], digits=".2f")
+
+
+def evaluate(world_from_cam: Array, seconds: Array, steps: Sequence[int], config: CameraBench) -> dict[int, Errors]:
+    """Errors by step.
 
     Args:
         world_from_cam: [N, 4, 4] m.
@@ -166,32 +169,13 @@ def _constant(measured: Array, seconds: Array, frames: Indices, steps: Sequence[
     return np.stack([np.linalg.matrix_power(motion, step) for step in steps])
 
 
-def _errors(future: Array, truth: Array, where: Array, moves: Array) -> Errors:
+def _errors(future: Array, truth: Array, where: Array, moves: Array) -> dict[str, Any]:
     """Of future [seeds, frames, 4, 4] in the frames ``where``."""
     if not where.any():
-        return Errors(np.nan, np.nan, 0)
+        return {"rotation_deg": np.nan, "translation_percent": np.nan, "frames": 0}
     future, truth, moves = future[:, where], truth[where], moves[where]
     off = future[..., :3, :3] @ truth[:, :3, :3].transpose(0, 2, 1)
     angle = Rotation.from_matrix(off.reshape(-1, 3, 3)).magnitude()
     miss = np.linalg.norm(future[..., :3, 3] - truth[:, :3, 3], axis=-1) / np.linalg.norm(truth[:, :3, 3], axis=-1)
     percent = 100 * miss[:, moves].mean() if moves.any() else np.nan
-    return Errors(float(np.degrees(angle.mean())), float(percent), int(where.sum()))
-
-
-def _as_dicts(parts: dict[str, dict[str, Errors]]) -> dict[str, Any]:
-    return {part: {name: errors._asdict() for name, errors in methods.items()} for part, methods in parts.items()}
-
-
-def _table(path: Path, scores: dict[int, dict[str, dict[str, Errors]]], steps: Sequence[int], interval: float) -> Table:
-    table = Table("ahead", "part", "frames", box=box.SIMPLE, title=str(path.name))
-    table.caption = "ratio: to constant velocity"
-    for heading in ("rotation (deg)", "ratio", "translation (%)", "ratio"):
-        table.add_column(heading, justify="right")
-    for step in steps:
-        for part, methods in scores[step].items():
-            ours, constant = methods["forecast"], methods["constant velocity"]
-            ratios = (f"{one / other:.2f}" for one, other in zip(ours[:2], constant[:2], strict=True))
-            rotation, translation = f"{ours.rotation_deg:.3f}", f"{ours.translation_percent:.2f}"
-            cells = (rotation, next(ratios), translation, next(ratios))
-            table.add_row(f"{step * interval:.2f} s", part, str(ours.frames), *cells)
-    return table
+    return {"rotation_deg": np.degrees(angle.mean()), "translation_percent": percent, "frames": int(where.sum())}

@@ -1,17 +1,15 @@
 """`vestcl bench depth`: one camera's depth against scans or a stereo pair: by motion, by a network, and combined."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import tyro
-from rich import box
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
-from vestcl.bench.common.results import plain, settings, write_json
+from vestcl.bench.common.options import JsonOption
+from vestcl.bench.common.results import console, plain, settings, write_json
+from vestcl.bench.common.table import Measurement, Section, show_grid
 from vestcl.cli.clip import load_estimators
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
@@ -23,12 +21,15 @@ from vestcl.scene.estimators import with_estimates
 #: What is compared.
 MOTION, NETWORK, COMBINED = "motion", "network", "combined"
 
+#: Mean errors as tables show them, in the order of `DepthScores`.
+_COLUMNS: Final = ("AbsRel", "median ratio", "AbsRel, scaled", "delta < 1.25")
+
 #: Frames that motion looks back at.
 _BEFORE: Final = 2
 
 
 @dataclass(frozen=True)
-class DepthBench:
+class DepthBench(JsonOption):
     """Measure the depth of single cameras: by their motion, by a network, and by both combined.
 
     The truth is the clip's depth, else that of its stereo pair. Neither that nor labels are seen.
@@ -46,8 +47,6 @@ class DepthBench:
     """The last; without it the clip's last."""
     crop: bool = False
     """Compare only the crop of Garg et al., as KITTI's tables do."""
-    json: Path | None = None
-    """File for the figures."""
 
     def __post_init__(self) -> None:
         if not self.inputs or self.every < 1 or self.first < 1:
@@ -64,10 +63,15 @@ def main(config: DepthBench) -> None:
         ValueError: an input that is no clip, has no depth to compare with, or no such frame; as the network's loader.
     """
     network = load_estimators(config.depth_model, None).depth
-    console, results = Console(), dict[str, Any]()
+    screen, results = console(), dict[str, Any]()
     for text in config.inputs:
-        scores = evaluate(open_sequence(text), network, config)
-        console.print(_table(text, scores))
+        scores, rows = evaluate(open_sequence(text), network, config), list[Measurement]()
+        for method, of_frames in scores.items():
+            means = np.mean([found[: len(_COLUMNS)] for found in of_frames.values()], axis=0)
+            rows.append(Measurement(method, "frames", str(len(of_frames))))
+            rows += [Measurement(method, *cell, digits=".3f") for cell in zip(_COLUMNS, means, strict=True)]
+        notes = ("means over the frames; AbsRel, scaled: of the depth over its median ratio",)
+        show_grid(Section(f"{text}: depth by", rows, notes).grid(), screen)
         results[text] = {
             method: {frame: found._asdict() for frame, found in of_frames.items()}
             for method, of_frames in scores.items()
@@ -109,14 +113,3 @@ def evaluate(clip: Clip, network: DepthOf | None, config: DepthBench) -> dict[st
         for name, depth in found.items():
             scores[name][index] = depth_scores(depth, true, crop=config.crop)
     return scores
-
-
-def _table(title: str, scores: dict[str, dict[int, DepthScores]]) -> Table:
-    table = Table("depth by", box=box.SIMPLE, title=title)
-    table.caption = "means over the frames; AbsRel, scaled: of the depth over its median ratio"
-    for heading in ("frames", "AbsRel", "median ratio", "AbsRel, scaled", "delta < 1.25"):
-        table.add_column(heading, justify="right")
-    for name, of_frames in scores.items():
-        means = np.mean([found[:4] for found in of_frames.values()], axis=0)
-        table.add_row(name, str(len(of_frames)), *(f"{value:.3f}" for value in means))
-    return table
