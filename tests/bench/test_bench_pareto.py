@@ -16,11 +16,12 @@ from vestcl.bench.pareto import bench as pareto
 from vestcl.bench.pareto import plots
 from vestcl.bench.pareto.bench import ParetoBench
 from vestcl.bench.pareto.front import PRICE, Point, front, knee
-from vestcl.bench.pareto.knobs import EXACT, Setting, combinations, combined, describe
+from vestcl.bench.pareto.knobs import EXACT, combinations, combined, describe, setting_of
 from vestcl.bench.pareto.scenes import double, scene, shrunk
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import quality
 from vestcl.models.inference.effort import Effort
+from vestcl.models.inference.quality import Settings
 from vestcl.models.inference.skipping import NOTHING, Skip
 
 #: Of vest-s, all that can be turned.
@@ -129,16 +130,15 @@ def test_front_and_knee_by_hand() -> None:
 
 
 def test_settings_are_combined_and_described() -> None:
-    for setting in (EXACT, Setting(NOTHING), Setting(Skip(margin=3), Effort(blocks=2), "bfloat16", 0.5)):
-        assert combined([setting]) == setting == combined([EXACT, setting])
-    assert EXACT.plain() == {} and Setting(Skip(margin=3)).plain() == {"skip": {"margin": 3}}
-    both = combined(
-        [Setting(effort=Effort(blocks=2)), Setting(Skip(margin=0)), Setting(effort=Effort(paint_scale=0.5))]
-    )
-    assert both == Setting(Skip(margin=0), Effort(blocks=2, paint_scale=0.5))
+    given = Settings(Skip(margin=3), Effort(blocks=2), "bfloat16")
+    assert setting_of(given) == {"skip": {"margin": 3}, "effort": {"blocks": 2}, "autocast": "bfloat16"}
+    assert setting_of(Settings(Skip(), Effort(), None)) == EXACT
+    assert Skip(**setting_of(Settings(NOTHING, Effort(), None))["skip"]) == NOTHING
+    both = combined([{"effort": {"blocks": 2}}, {"skip": {"margin": 0}}, {"effort": {"paint_scale": 0.5}}])
+    assert both == {"effort": {"blocks": 2, "paint_scale": 0.5}, "skip": {"margin": 0}}
     assert describe(both) == "margin 0, blocks 2, paint_scale 0.5" and describe(EXACT) == "exact"
-    every = combinations([[EXACT, Setting(size=0.5)], [EXACT, Setting(autocast="bfloat16")]])
-    assert len(every) == 4 and every[0] == EXACT and every[-1] == Setting(autocast="bfloat16", size=0.5)
+    every = combinations([[EXACT, {"size": 0.5}], [EXACT, {"autocast": "bfloat16"}]])
+    assert len(every) == 4 and every[0] == EXACT and every[-1] == {"autocast": "bfloat16", "size": 0.5}
 
 
 def test_a_smaller_scene_is_the_same_view() -> None:

@@ -7,7 +7,7 @@ import torch
 from forecaster_scenes import PAINTING, SMALL, TINY
 
 from vestcl.bench.common.results import load
-from vestcl.bench.pareto.knobs import Setting, describe
+from vestcl.bench.pareto.knobs import describe, setting_of
 from vestcl.bench.pareto.measure import step
 from vestcl.bench.pareto.scenes import Scene, scene
 from vestcl.evaluation import metrics
@@ -59,7 +59,7 @@ def test_the_committed_figures_keep_the_bound() -> None:
         points = {point["value"]: point for point in together["points"]}
         seconds = []
         for level in LEVELS:
-            name = describe(Setting(*quality.settings(level)))
+            name = describe(setting_of(quality.settings(level)))
             assert together["qualities"][level] == name, "measure again: `vestcl bench pareto`"
             assert points[name]["loss"] <= LOSS[level]
             seconds.append(points[name]["seconds"]["median"])

@@ -12,26 +12,14 @@ from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.table import Measurement, Section, show_grid
 from vestcl.bench.forecast.config import HELD_OUT, ForecastBench, check
+from vestcl.bench.forecast.kept import Facts
 from vestcl.bench.forecast.run import Networks, kept_windows, run
-from vestcl.bench.forecast.truth import Facts
 from vestcl.bench.forecast.windows import Group, groups_of
+from vestcl.evaluation import tables
 from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.regions import REGIONS
 from vestcl.evaluation.scores import Record
 from vestcl.evaluation.statistics import interval_grid
-from vestcl.evaluation.tables import (
-    METRICS,
-    Grid,
-    by_method,
-    by_view,
-    finite,
-    horizon,
-    means,
-    picture_grids,
-    steps_of,
-    summarise,
-    to_markdown,
-)
 from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.forecasting import peer
 from vestcl.io.atomic import write_bytes
@@ -97,28 +85,25 @@ def main(config: ForecastBench) -> None:
         content = {"machine": machine, "config": _results.settings(config), "inputs": inputs}
         _results.write_json(config.out, content)
     if config.markdown is not None:
-        write_bytes(config.markdown, "\n".join(map(to_markdown, grids)).encode())
+        write_bytes(config.markdown, "\n".join(map(tables.to_markdown, grids)).encode())
     _results.tell_written(console, config.out, config.markdown)
     kept.remove()
 
 
 def as_json(group: Group) -> dict[str, Any]:
     """A group as the JSON file has it; means are by horizon, and running (the mean up to the horizon)."""
-    found: dict[str, Any] = finite({
+    found: dict[str, Any] = tables.finite({
         "input": group.name,
         "use": group.use,
-        "views": summarise(group.records),
-        "facts": means([facts.values for facts in group.facts]),
+        "views": tables.summarise(group.records),
+        "facts": tables.means([facts.values for facts in group.facts]),
         "windows": [dataclasses.asdict(record) for record in group.records],
         "window_facts": [dataclasses.asdict(facts) for facts in group.facts],
     })  # fmt: skip
     return found
 
 
-# ---------------------------------------------------------------- tables
-
-
-def grids_of(groups: Sequence[Group], horizons: Sequence[int]) -> list[Grid]:
+def grids_of(groups: Sequence[Group], horizons: Sequence[int]) -> list[tables.Grid]:
     """Each group's images, their 95 % intervals where it has several clips, its facts, and a table over all groups.
 
     Args:
@@ -127,8 +112,8 @@ def grids_of(groups: Sequence[Group], horizons: Sequence[int]) -> list[Grid]:
     """
     grids = []
     for group in groups:
-        grids += picture_grids(group.title, group.records, horizons)
-        for view, own in by_view(group.records).items():
+        grids += tables.picture_grids(group.title, group.records, horizons)
+        for view, own in tables.by_view(group.records).items():
             if len({record.clip for record in own}) > 1:
                 title = f"{group.title}, view {view}, mean and 95 % interval"
                 grids.append(interval_grid(title, own, horizons, _headline(own)))
@@ -139,7 +124,7 @@ def grids_of(groups: Sequence[Group], horizons: Sequence[int]) -> list[Grid]:
     return grids
 
 
-def fact_grids(name: str, facts: Sequence[Facts], horizons: Sequence[int]) -> list[Grid]:
+def fact_grids(name: str, facts: Sequence[Facts], horizons: Sequence[int]) -> list[tables.Grid]:
     """A table of what is known besides images, if anything is.
 
     Args:
@@ -147,7 +132,7 @@ def fact_grids(name: str, facts: Sequence[Facts], horizons: Sequence[int]) -> li
         facts: of all windows.
         horizons: the steps to show, from 1.
     """
-    found = means([fact.values for fact in facts])
+    found = tables.means([fact.values for fact in facts])
     rows = [
         Measurement(label, f"t+{k}", found[metric][k - 1], digits=digits)
         for metric, (label, digits) in _FACTS.items()
@@ -158,7 +143,7 @@ def fact_grids(name: str, facts: Sequence[Facts], horizons: Sequence[int]) -> li
     return [Section(title, rows).grid()] if rows else []
 
 
-def overview(groups: Sequence[Group], view: str, horizons: Sequence[int]) -> Grid:
+def overview(groups: Sequence[Group], view: str, horizons: Sequence[int]) -> tables.Grid:
     """A table of one view over all groups: a row a group and method.
 
     Args:
@@ -168,14 +153,14 @@ def overview(groups: Sequence[Group], view: str, horizons: Sequence[int]) -> Gri
     """
     of_view = {group.title: [record for record in group.records if record.view == view] for group in groups}
     records = [record for own in of_view.values() for record in own]
-    steps, shown, rows = steps_of(records, horizons), _headline(records), list[Measurement]()
+    steps, shown, rows = tables.steps_of(records, horizons), _headline(records), list[Measurement]()
     for title, of_group in of_view.items():
-        for (_, method), own in by_method(of_group).items():
-            found, row = means([record.scores for record in own]), f"{title}: {method}"
+        for (_, method), own in tables.by_method(of_group).items():
+            found, row = tables.means([record.scores for record in own]), f"{title}: {method}"
             rows.append(Measurement(row, "windows", str(len(own))))
             for metric in shown:
-                label, digits = METRICS[metric].label, METRICS[metric].digits
-                numbers = ((horizon(k), found[metric][k - own[0].first]) for k in steps)
+                label, digits = tables.METRICS[metric].label, tables.METRICS[metric].digits
+                numbers = ((tables.horizon(k), found[metric][k - own[0].first]) for k in steps)
                 rows += [Measurement(row, f"{label} {at}", number, digits=digits) for at, number in numbers]
     return Section(f"all inputs, view {view}", rows).grid()
 

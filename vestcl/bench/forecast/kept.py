@@ -7,12 +7,25 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import vestcl
-from vestcl.bench.forecast.truth import Facts
 from vestcl.evaluation.scores import Record
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Errors of one window's forecast other than in images."""
+
+    clip: str
+    frame: str
+    index: int
+    """Of the current frame t in the clip."""
+    values: dict[str, list[float]]
+    """By what is measured, a number a step."""
+
 
 Window = tuple[list[Record], list[Facts]]
 

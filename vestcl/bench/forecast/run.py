@@ -9,13 +9,12 @@ from typing import Final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from vestcl.bench.forecast import truth as known
 from vestcl.bench.forecast.config import ForecastBench
-from vestcl.bench.forecast.kept import SUFFIX, Kept, Window
-from vestcl.bench.forecast.truth import Facts
+from vestcl.bench.forecast.kept import SUFFIX, Facts, Kept, Window
 from vestcl.bench.forecast.windows import Group
 from vestcl.cli.progress import ProgressBar
 from vestcl.data.sample import Clip
+from vestcl.evaluation import street
 from vestcl.evaluation.methods import forecasts_of
 from vestcl.evaluation.motion import ego_errors, true_motion
 from vestcl.evaluation.perceptual import StLpips
@@ -72,7 +71,8 @@ def run(groups: Sequence[Group], config: ForecastBench, networks: Networks, kept
         ValueError: as the readers and forecasts; a window can't be kept.
     """
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with ProgressBar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal) as bar:
+    hidden = not console.is_terminal
+    with ProgressBar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden) as bar:
         task = bar.add_task("windows", total=sum(len(chosen) for group in groups for _, chosen in group.clips))
         for group in groups:
             for clip, chosen in group.clips:
@@ -116,9 +116,9 @@ def run_clip(
         records = score(truth, index, views, predictions(truth, index, steps, views, forecasts), forecast)
         values = error_shares(truth, forecast, index, views[0])
         values |= {} if motion is None else ego_errors(forecast, motion)
-        if known.shot(clip[index]) is not None:
-            values |= known.motion_errors(forecast, clip, index, SOURCE) if SOURCE in config.views else {}
-            values |= known.splatter_alone(clip, index)
+        if street.shot(clip[index]) is not None:
+            values |= street.motion_errors(forecast, clip, index, SOURCE) if SOURCE in config.views else {}
+            values |= street.splatter_alone(clip, index)
         yield records, [Facts(clip.name, clip[index].name, index, values)]
 
 

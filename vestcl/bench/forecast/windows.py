@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from vestcl.bench.forecast.config import HELD_OUT, ForecastBench
-from vestcl.bench.forecast.truth import Facts
+from vestcl.bench.forecast.kept import Facts
 from vestcl.cli.checks import check_input
 from vestcl.cli.clip import load_estimators, with_estimates
 from vestcl.data.open import open_sequence

@@ -14,7 +14,7 @@ from vestcl.bench.common.options import Options
 from vestcl.bench.common.table import Measurement, Section
 from vestcl.bench.pareto import plots
 from vestcl.bench.pareto.front import PRICE, Point, front, knee
-from vestcl.bench.pareto.knobs import EXACT, Setting, combinations, describe, knobs
+from vestcl.bench.pareto.knobs import EXACT, Setting, combinations, describe, knobs, setting_of
 from vestcl.bench.pareto.measure import Bench, measure, recursions
 from vestcl.bench.pareto.scenes import scene
 from vestcl.models.inference import pretrained, quality
@@ -105,7 +105,7 @@ def _measure(config: ParetoBench, _: opencl.Session, console: Console) -> Iterat
 
 def _combined(bench: Bench, choices: Sequence[Sequence[Setting]]) -> Section:
     """Every combination of the knobs' defaults and knees, and the named qualities, against the exact forecast."""
-    named = {level: Setting(*quality.settings(level)) for level in quality.LEVELS}
+    named = {level: setting_of(quality.settings(level)) for level in quality.LEVELS}
     settings = {describe(setting): setting for setting in (*combinations(choices), *named.values())}
     points = measure(bench, settings)
     best = [point.value for point in front(points)]

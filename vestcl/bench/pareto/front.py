@@ -18,7 +18,7 @@ class Point:
     value: str
     """Of the knob, or a description of several."""
     setting: dict[str, Any]
-    """`Setting.plain`."""
+    """What differs from the defaults."""
     seconds: Spread
     """Of one forecast step, mean over the streets."""
     rms: Spread

@@ -12,13 +12,13 @@ import torch
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.timing import Spread
 from vestcl.bench.pareto.front import Point
-from vestcl.bench.pareto.knobs import EXACT, Setting
+from vestcl.bench.pareto.knobs import EXACT, Setting, describe
 from vestcl.bench.pareto.scenes import Scene, double, shrunk
 from vestcl.evaluation import metrics
 from vestcl.forecasting.network.input import NetworkInput
 from vestcl.models.forecaster import Forecaster, Mode
-from vestcl.models.inference.effort import enlarged
-from vestcl.models.inference.skipping import NOTHING
+from vestcl.models.inference.effort import Effort, enlarged
+from vestcl.models.inference.skipping import NOTHING, Skip
 from vestcl.models.steps.memory import EncodedFrames
 
 Images = list[torch.Tensor]
@@ -54,8 +54,8 @@ def step(model: Forecaster, given: NetworkInput, steps: int = 1, mode: Mode | No
 
 def apply(model: Forecaster, setting: Setting) -> None:
     """Set the switches of ``setting``; its size is that of the input."""
-    model.skip, model.effort = setting.skip, setting.effort
-    model.autocast = torch.bfloat16 if setting.autocast else None
+    model.skip, model.effort = Skip(**setting.get("skip", {})), Effort(**setting.get("effort", {}))
+    model.autocast = torch.bfloat16 if "autocast" in setting else None
 
 
 def measure(bench: Bench, settings: Mapping[str, Setting]) -> list[Point]:
@@ -84,12 +84,12 @@ def measure(bench: Bench, settings: Mapping[str, Setting]) -> list[Point]:
         ms_ssim = _compared(bench, metrics.ms_ssim, images[name]) if large else [float("nan")] * len(psnr[name])
         errors, psnrs, ms_ssims = (Spread.of(np.array(values)) for values in (rms, psnr[name], ms_ssim))
         time, loss = Spread.of(seconds[name] / len(bench.scenes)), sum(losses) / len(losses)
-        points.append(Point(name, settings[name].plain(), time, errors, psnrs, ms_ssims, loss, max(losses)))
+        points.append(Point(name, settings[name], time, errors, psnrs, ms_ssims, loss, max(losses)))
     return points
 
 
 def _task(bench: Bench, setting: Setting, keep: Callable[[Images], None]) -> Callable[[], object]:
-    inputs = [shrunk(scene.given, setting.size) for scene in bench.scenes]
+    inputs = [shrunk(scene.given, setting.get("size", 1.0)) for scene in bench.scenes]
     memories = [_memory(bench, setting, index, given) for index, given in enumerate(inputs)]
 
     def task() -> None:
@@ -105,7 +105,7 @@ def _task(bench: Bench, setting: Setting, keep: Callable[[Images], None]) -> Cal
 
 def _memory(bench: Bench, setting: Setting, index: int, given: NetworkInput) -> EncodedFrames:
     """The model's memory when it has seen the frame at t - 1."""
-    key = setting.skip, setting.autocast, setting.size, index
+    key = index, describe({name: value for name, value in setting.items() if name != "effort"})
     if key not in bench.memories:
         bench.model.memory = EncodedFrames()
         apply(bench.model, setting)

@@ -77,9 +77,9 @@ def main(config: StabilityBench) -> int:
 
     def measure(_: opencl.Session, console: Console) -> Iterator[Section]:
         for family in families:
-            yield section(
-                family, [_measured(case, config.peers, console) for case in family.cases(config.seed, config.quick)]
-            )
+            with console.status(family.name):
+                rows = [measure_case(case, config.peers) for case in family.cases(config.seed, config.quick)]
+            yield section(family, rows)
 
     results = _results.run("stability", config, measure)
     for number, result in enumerate(results):
@@ -92,11 +92,6 @@ def main(config: StabilityBench) -> int:
     if not broken:
         console.print(f"[green]all bounds kept[/] in {len(rows)} cases", highlight=False)
     return 1 if broken else 0
-
-
-def _measured(case: Case, peers: bool, console: Console) -> Row:
-    with console.status(case.name):
-        return measure_case(case, peers)
 
 
 def measure_case(case: Case, peers: bool = True) -> Row:
@@ -138,9 +133,6 @@ def _float64() -> Iterator[None]:
         raise opencl.DeviceError("no OpenCL device has float64, which the truth needs: see `vestcl devices`")
     with opencl.use(able[0].index):
         yield
-
-
-# ---------------------------------------------------------------- tables and plots
 
 
 def section(family: Family, rows: Sequence[Row]) -> Section:

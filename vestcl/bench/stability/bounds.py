@@ -130,9 +130,6 @@ def _with_noise(values: Tensors, limits: Tensors, generator: torch.Generator) ->
     return tuple(v + limit.detach() * (2 * draw - 1) for v, limit, draw in zip(values, limits, draws, strict=True))
 
 
-# ---------------------------------------------------------------- limits from counterparts
-
-
 def _add(points_xyz: torch.Tensor, displacement_xyz: torch.Tensor) -> Limits:
     return [UNIT * (points_xyz + displacement_xyz).abs()], lambda grads: [UNIT * grads[0].abs()] * 2
 

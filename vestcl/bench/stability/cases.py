@@ -20,29 +20,23 @@ from vestcl import constants, geometry, reference
 Inputs = dict[str, torch.Tensor]
 Program = Literal["splat", "view", "flow"]
 Built = tuple[Program, Inputs, tuple[int, int]]
+"""A program, its inputs, and (height, width) of the image."""
 
-#: Channels of the features: colour.
-CHANNELS: Final = 3
-
-#: Height and width of images that are not a family's knob: several tiles, the last ones partial.
+#: Height and width of images where they are not the knob: several tiles, the last ones partial. Depths, m.
 SIZE: Final = (36, 52)
+DEPTHS: Final = (5.0, 50.0)
 
 #: Focal length in image widths: KITTI's cameras see 80 degrees across.
 FOCAL: Final = 0.6
 
 #: Mean rotation of one motion about each axis, radians, and its mean translation along each, metres: after 50 of them
-#: most points that are 5 to 50 m away are still in the image. The shorter one is for points at the near plane.
+#: most points are still in the image. The shorter one is for points at the near plane.
 ROTATION: Final = 3e-3
 TRANSLATION: Final = 0.1
 SHORT_TRANSLATION: Final = 0.02
 
-#: Depths of points where they are not the knob, metres.
-DEPTHS: Final = (5.0, 50.0)
-
-#: Opacity where it is not the knob: every alpha stays clear of 1.
+#: Opacity where it is not the knob: every alpha stays clear of 1. The sum of a pixel's alphas: the last still shows.
 _OPACITY: Final = 0.9
-
-#: Sum of one pixel's alphas: many, and the last fragment still shows.
 _ALPHAS: Final = 2.0
 
 #: Points of the "radius" family, and of rigid flows: several for each of rigid_flow's 256 partial sums.
@@ -55,11 +49,7 @@ _ORACLE: Final = 1.5
 _VIEWED: Final = 1.8
 _STRIDES: Final = 0.8
 
-#: Translation of the "angle" family, metres per radian: negligible against what a rotation moves points by.
-_NEGLIGIBLE: Final = 1e-3
-
-#: Pixels of the "size" family's images between points along each axis: at 4096 x 2048 the lists of fragments take some
-#: GB even so.
+#: Pixels of the "size" family's images between points along each axis: at 4096 x 2048 the fragments take some GB.
 _STRIDE: Final = 4
 
 #: Radii are chosen from this range around the nominal one, and so many distances are computed at once: some 100 MB.
@@ -122,9 +112,6 @@ class Family:
         return found
 
 
-# ---------------------------------------------------------------- splat
-
-
 def _layers(count: float, generator: torch.Generator) -> Built:
     """``count`` fragments in each of 4 x 4 pixels, so faint that the last one still shows."""
     points, size = int(count), (4, 4)
@@ -161,9 +148,6 @@ def _opacities(missing: float, generator: torch.Generator) -> Built:
     inputs["radii"] = torch.full((1, points), _ORACLE, dtype=torch.float64)
     inputs["z"] = _depths(points, *DEPTHS, generator)[None]
     return "splat", inputs, SIZE
-
-
-# ---------------------------------------------------------------- unproject, move, project, splat
 
 
 def _origins(metres: float, generator: torch.Generator) -> Built:
@@ -207,9 +191,6 @@ def projected(inputs: Mapping[str, torch.Tensor]) -> torch.Tensor:
     return reference.displace(points, torch.zeros_like(points), inputs["K"], inputs["tgt_from_src"])[0][0]
 
 
-# ---------------------------------------------------------------- rigid flow
-
-
 def _quaternions(length: float, generator: torch.Generator) -> Built:
     """A quaternion of some ``length``, of a large rotation."""
     direction = torch.tensor([[0.5, -0.3, 0.7, 0.4]], dtype=torch.float64)
@@ -217,11 +198,11 @@ def _quaternions(length: float, generator: torch.Generator) -> Built:
 
 
 def _angles(angle: float, generator: torch.Generator) -> Built:
-    """A rotation by ``angle``, and no translation that would hide it."""
+    """A rotation by ``angle``, and a translation so small, 1 mm per radian, that it does not hide it."""
     axis = torch.tensor([[0.48, 0.6, 0.64]], dtype=torch.float64)
     turn = torch.cat([torch.full((1, 1), math.cos(angle / 2), dtype=torch.float64), math.sin(angle / 2) * axis], dim=1)
     program, inputs, size = _flow(turn, generator)
-    inputs["translation"] = _NEGLIGIBLE * angle * inputs["translation"]
+    inputs["translation"] = 1e-3 * angle * inputs["translation"]
     return program, inputs, size
 
 
@@ -232,9 +213,6 @@ def _flow(quaternion: torch.Tensor, generator: torch.Generator) -> Built:
     return "flow", inputs, (0, 0)
 
 
-# ---------------------------------------------------------------- shared
-
-
 def _uniform(generator: torch.Generator, *shape: int) -> torch.Tensor:
     return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
@@ -242,9 +220,9 @@ def _uniform(generator: torch.Generator, *shape: int) -> torch.Tensor:
 def _appearance(points: int, generator: torch.Generator, opacity: float) -> Inputs:
     """Colours in [0, 1], opacities from half of ``opacity`` to all of it, and a background."""
     return {
-        "features": _uniform(generator, 1, points, CHANNELS),
+        "features": _uniform(generator, 1, points, 3),
         "opacities": opacity * (0.5 + 0.5 * _uniform(generator, 1, points)),
-        "backgrounds": _uniform(generator, 1, CHANNELS),
+        "backgrounds": _uniform(generator, 1, 3),
     }
 
 
@@ -290,15 +268,11 @@ def _middles(distances: torch.Tensor, low: float, high: float) -> torch.Tensor:
     return marks.gather(1, at[:, None])[:, 0] + widths / 2
 
 
-def _near_plane(nearest: float, farthest: float, generator: torch.Generator) -> Built:
-    return _view(generator, (nearest, farthest), translation=SHORT_TRANSLATION)
-
-
 FAMILIES: Final = (
     Family("depth", "nearest depth, m (farthest: twice it)", (0.1, 1, 10, 100, 1e3, 1e4), (0.1, 1e4),
-           lambda metres, generator: _near_plane(metres, 2 * metres, generator)),
+           lambda metres, generator: _view(generator, (metres, 2 * metres), translation=SHORT_TRANSLATION)),
     Family("depth range", "farthest depth, m (nearest: 0.1 m)", (1, 10, 100, 1e3, 1e4), (1e4,),
-           lambda farthest, generator: _near_plane(constants.NEAR, farthest, generator)),
+           lambda metres, generator: _view(generator, (constants.NEAR, metres), translation=SHORT_TRANSLATION)),
     Family("layers", "number of fragments per pixel", (1, 10, 100, 1e3, 1e4), (1, 100), _layers),
     Family("radius", "radius, px", (1e-3, 1e-2, 0.1, 0.5, 1.5, 8, 100, 1e3, 1e4), (1e-3, 1.5, 1e4), _radii),
     Family("opacity", "distance of opacity from 1",

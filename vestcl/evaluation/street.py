@@ -1,6 +1,5 @@
-"""What `vestcl bench forecast` knows of streets besides images: true 3D motion, and the splatter on true scenes."""
+"""What is known of procedural streets besides images: true 3D motion, and the splatter on true scenes."""
 
-from dataclasses import dataclass
 from typing import Final
 
 import cv2
@@ -26,18 +25,6 @@ _HIDDEN: Final = 1.03
 _NEAREST: Final = 0.1
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Facts:
-    """Errors of one window's forecast other than in images."""
-
-    clip: str
-    frame: str
-    index: int
-    """Of the current frame t in the clip."""
-    values: dict[str, list[float]]
-    """By what is measured, a number a step."""
 
 
 def shot(sample: Sample) -> Shot | None:
