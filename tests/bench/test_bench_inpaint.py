@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vestcl.bench.forecast import inpaint, open_pixels
+from vestcl.bench.forecast import inpaint
 from vestcl.bench.forecast.inpaint import InpaintBench, main, score
 from vestcl.cli.main import main as command
 from vestcl.data import Street, street_clip
@@ -49,15 +49,15 @@ def test_an_unknown_method_is_told(capsys: pytest.CaptureFixture[str]) -> None:
 def test_open_pixels_of_a_street() -> None:
     """Scores of every step, camera and number of frames; more memory covers no fewer of the open pixels."""
     clip = street_clip(Street.generate(4), 10, 48, 160)
-    assert open_pixels.windows_of(clip, 1, (0, 2)) == [3]
-    scores = list(open_pixels.measure(clip, [3], (0, 2), None))
+    assert inpaint.windows_of(clip, 1, (0, 2)) == [3]
+    scores = list(inpaint.measure_open(clip, [3], (0, 2), None))
     assert [(one["step"], one["memory"]) for one in scores if one["view"] == "source"] == [
-        (step, count) for step in open_pixels.STEPS for count in (0, 2)
+        (step, count) for step in inpaint.STEPS for count in (0, 2)
     ]
     assert all(one["filled"] == 0 for one in scores if one["memory"] == 0) and any(one["filled"] > 0 for one in scores)
-    assert len(open_pixels.section(scores, "street").grid().rows) == 2
+    assert len(inpaint.open_section(scores, "street").grid().rows) == 2
     with pytest.raises(ValueError, match="must have 9 frames or more, got 8"):
-        open_pixels.windows_of(clip[:8], 1, (0, 2))
+        inpaint.windows_of(clip[:8], 1, (0, 2))
 
 
 @pytest.mark.parametrize(("option", "words"), [({"windows": 0}, "`windows`"), ({"memory": (-1,)}, "`memory`")])

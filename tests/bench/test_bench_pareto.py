@@ -15,8 +15,8 @@ from vestcl.bench.common.timing import Spread
 from vestcl.bench.pareto import bench as pareto
 from vestcl.bench.pareto import plots
 from vestcl.bench.pareto.bench import ParetoBench
-from vestcl.bench.pareto.front import PRICE, Point, front, knee
 from vestcl.bench.pareto.knobs import EXACT, combinations, combined, describe, setting_of
+from vestcl.bench.pareto.measure import PRICE, Point, front, knee
 from vestcl.bench.pareto.scenes import double, scene, shrunk
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import quality

@@ -13,9 +13,8 @@ from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.table import Measurement, Section
 from vestcl.bench.pareto import plots
-from vestcl.bench.pareto.front import PRICE, Point, front, knee
 from vestcl.bench.pareto.knobs import EXACT, Setting, combinations, describe, knobs, setting_of
-from vestcl.bench.pareto.measure import Bench, measure, recursions
+from vestcl.bench.pareto.measure import PRICE, Bench, Point, front, knee, measure, recursions
 from vestcl.bench.pareto.scenes import scene
 from vestcl.models.inference import pretrained, quality
 from vestcl.models.inference.fast import accelerate

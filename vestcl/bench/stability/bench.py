@@ -189,7 +189,8 @@ def draw(rows: Sequence[Mapping[str, Any]], folder: Path, prefix: str = "") -> N
             knobs = [row["knob"] or zero for row in own]
             lines = [Curve(name, knobs, of, dashed=not name.startswith("vestcl")) for name, of in values.items()]
             title = f"{family.name}: relative error of float32 against float64, maximum norm"
-            curves(folder / file_name(f"{prefix}{family.name}"), title, family.knob, "relative error", lines)
+            label = f"{family.knob}{f' (0 is drawn at {zero:.2g})' if zero in knobs else ''}"
+            curves(folder / file_name(f"{prefix}{family.name}"), title, label, "relative error", lines)
 
 
 def _spread(error: float | None) -> Spread:
