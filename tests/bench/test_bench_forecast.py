@@ -47,7 +47,7 @@ def rendered(image: np.ndarray, motion: np.ndarray | None = None, depth: np.ndar
 
 
 def test_scores_of_known_errors() -> None:
-    """Truth + 0.1 is 20 dB; the same picture, infinitely good."""
+    """Truth + 0.1 is 20 dB; the same image, infinitely good."""
     clip = clip_of_street()
     images = [clip[i].read_image() for i in (2, 3)]
     grey = [np.clip(image, 0, 0.8).astype(np.float32) for image in images]

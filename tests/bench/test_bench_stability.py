@@ -52,7 +52,7 @@ def with_splat(splat: Any) -> Operators:
 def test_float32_keeps_the_bounds_and_float64_tighter_ones(case: Case) -> None:
     """The truth, against the reference in float64, keeps bounds that are 2^29 times tighter, for two that round.
 
-    Motions alone are held against 50 digits: the reference takes their difference, which the truth does not.
+    Rigid flows are compared with 50 digits: the reference takes their difference, which the truth does not.
     """
     row = stability.measure_case(case, peers=False)
     assert row["kept"]
@@ -158,7 +158,7 @@ def test_radii_keep_clear_of_pixel_centres(wanted: float) -> None:
 
 
 def test_a_view_is_where_its_radii_were_chosen() -> None:
-    """The operators' places are those that radii keep clear for."""
+    """The operators project to the points that radii keep clear of."""
     seen: list[torch.Tensor] = []
 
     def looking(points_uv: torch.Tensor, *others: Any) -> tuple[torch.Tensor, torch.Tensor]:
@@ -171,7 +171,7 @@ def test_a_view_is_where_its_radii_were_chosen() -> None:
 
 
 def test_layers_by_hand() -> None:
-    """Two points on 3 x 1 pixels: the far one comes first in memory and reaches all, the near one the middle alone."""
+    """Two points on 3 x 1 pixels: the far one comes first in memory and reaches all, the near one only the middle."""
     uv, z, radii = torch.tensor([[1.5, 0.5], [1.5, 0.5]]), torch.tensor([4.0, 2.0]), torch.tensor([2.0, 0.5])
     layers = list_layers(uv, z, radii, 1, 3)
     found = [sorted(zip(layers.pixels[s].tolist(), layers.points[s].tolist(), strict=True)) for s in layers.slices]

@@ -64,7 +64,7 @@ def test_step_truth_is_the_cameras_motion_where_nothing_moves() -> None:
     static = cur.read_mask()[0] & (cur.read_labels()[0] != SKY)
     wanted = points - (np.einsum("ij,jhw->ihw", before[:3, :3], points) + before[:3, 3, None, None])
     np.testing.assert_allclose(known.step_truth(clip, 3)[:, static], wanted[:, static], atol=1e-3)
-    assert known.step_truth(clip, 3)[2][static].mean() < -0.5  # what stands comes nearer
+    assert known.step_truth(clip, 3)[2][static].mean() < -0.5  # static points come nearer
 
 
 def test_motion_errors_are_what_was_put_in() -> None:
@@ -94,8 +94,8 @@ def test_ego_errors_by_hand() -> None:
     truth[2, 3] = -2.0
     estimate = truth.copy()
     estimate[0, 3] = 0.1
-    stands = np.eye(4)
-    errors = ego_errors(Forecast("", [estimate, stands], []), [truth, stands])
+    at_rest = np.eye(4)
+    errors = ego_errors(Forecast("", [estimate, at_rest], []), [truth, at_rest])
     assert errors["translation_percent"][0] == pytest.approx(5.0)
     assert np.isnan(errors["translation_percent"][1]) and errors["rotation_deg"] == [0.0, 0.0]
 

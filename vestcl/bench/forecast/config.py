@@ -9,7 +9,7 @@ import tyro
 from vestcl.evaluation.st_lpips import Option as StLpipsOption
 from vestcl.models.inference.quality import Quality
 
-#: Streets that nothing is tuned, trained or tested on: what "street:" stands for.
+#: Streets that nothing is tuned, trained or tested on: "street:" is short for them.
 HELD_OUT: Final = range(1000, 1020)
 
 #: Steps that tables show where none are chosen.

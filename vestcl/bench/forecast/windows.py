@@ -68,7 +68,7 @@ def groups_of(config: ForecastBench) -> list[Group]:
 
 
 def clips_of(text: str, config: ForecastBench) -> list[Clip]:
-    """The clips that one input stands for.
+    """The clips of one input.
 
     Args:
         text: "street:", "street:SEED", "street:FIRST-LAST", or what `vestcl.data.open.open_sequence` opens.

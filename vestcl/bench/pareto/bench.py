@@ -23,7 +23,7 @@ from vestcl.models.inference.fast import accelerate
 HORIZONS: Final = (1, 3, 5)
 
 #: Knobs that are in no combination: each value of "skipping" is exact.
-ALONE: Final = ("skipping",)
+NOT_COMBINED: Final = ("skipping",)
 
 _NOTES: Final = (
     "time: ms/step, median and quartiles; t - 1 is remembered. x: the exact one's time over it.",
@@ -89,7 +89,7 @@ def _measure(config: ParetoBench, _: opencl.Session, console: Console) -> Iterat
                 points = measure(bench, knob.values)
             default, bend = points[0].value, knee(points).value
             details[knob.name] = {"about": knob.about, "default": default, "knee": bend, "points": points}
-            if knob.name not in ALONE and knob.values[bend] != EXACT:
+            if knob.name not in NOT_COMBINED and knob.values[bend] != EXACT:
                 best.append([EXACT, knob.values[bend]])
             rows = _rows(points, {default: "default", bend: "knee"}, f"{knob.name} ")
             yield Section(f"{knob.name}: {knob.about}", rows, _NOTES, {"knobs": details})

@@ -77,7 +77,7 @@ def knobs(model: Forecaster) -> list[Knob]:
         found.append(Knob("margin", "pixels around the foreground that are computed with it", margins))
     if config.object_motion is not None and config.object_motion.where == "foreground":
         values = {"forecast anew": EXACT, "taken to stand": {"skip": {"still": True}}}
-        found.append(Knob("still", "things that were measured to stand", values))
+        found.append(Knob("still", "objects that were measured to be static", values))
     return found
 
 
