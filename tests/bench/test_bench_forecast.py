@@ -97,6 +97,7 @@ def test_tables_by_hand() -> None:
     lines = tables.to_markdown(grid).splitlines()
     assert lines[2:5] == ["|  | PSNR t+2 | s |", "| --- | ---: | ---: |", "| a | 25.00 | 3.00 |"]
     assert bench.fact_grids("clip", [], (1,)) == []
+    assert ForecastBench(("x",), horizons=(3, 1, 3)).shown == (3, 1) and ForecastBench(("x",), steps=3).shown == (1, 3)
 
 
 # ---------------------------------------------------------------- whole runs

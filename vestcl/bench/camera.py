@@ -75,7 +75,7 @@ def main(config: CameraBench) -> None:
         interval = float(np.median(np.diff(drive.seconds)))
         steps = sorted({max(1, round(seconds / interval)) for seconds in config.ahead})
         found = evaluate(drive.world_from_cam, drive.seconds, steps, config)
-        rows = [row for step in steps for row in _rows(f"{step * interval:.2f} s", found[step])]
+        rows = [row for step in steps for row in _rows(f"{step * interval:g} s", found[step])]
         show_grid(Section(path.name, rows, ("ratio: to constant velocity",)).grid(), screen)
         results[str(path)] = {f"{step * interval:g} s": found[step] for step in steps}
     if config.json is not None:

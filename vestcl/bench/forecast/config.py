@@ -77,8 +77,8 @@ class ForecastBench:
 
     @property
     def shown(self) -> tuple[int, ...]:
-        """Steps that tables show."""
-        return self.horizons or tuple(k for k in HORIZONS if k <= self.steps)
+        """Steps that tables show, each once."""
+        return tuple(dict.fromkeys(self.horizons)) or tuple(k for k in HORIZONS if k <= self.steps)
 
 
 def check(config: ForecastBench) -> None:
