@@ -18,6 +18,8 @@ setup(
     package_data={"vestcl": ["weights/*.safetensors"], "vestcl.kernels": ["*.cl", "*.h", "*/*.cl", "*/*.h"]},
     install_requires=[
         "av>=17.1",  # the newest for Python 3.10
+        "huggingface_hub>=0.27",
+        "Jinja2>=3",  # of model cards
         "matplotlib>=3.8",
         "numpy>=1.26",
         "opencv-contrib-python-headless>=4.10.0.82",

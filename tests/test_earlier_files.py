@@ -13,7 +13,7 @@ import yaml
 from train import fit
 from vestcl.cli import main as cli
 from vestcl.models import config
-from vestcl.models.inference.pretrained import load_model
+from vestcl.models.forecaster import Forecaster
 from vestcl.prepare.prepared import find_prepared
 
 EARLIER = Path(__file__).parent / "earlier"
@@ -38,7 +38,7 @@ def test_a_prepared_clip_opens() -> None:
 
 
 def test_a_checkpoint_opens_as_a_model() -> None:
-    model = load_model(EARLIER / "run" / CHECKPOINT / "ema.safetensors")
+    model = Forecaster.from_pretrained(EARLIER / "run" / CHECKPOINT / "ema.safetensors")
     assert sum(weights.numel() for weights in model.parameters()) == 28336
 
 

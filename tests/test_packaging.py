@@ -19,10 +19,10 @@ WEIGHTS = "vestcl/weights/vest-s.safetensors"
 BUILD_A_KERNEL = """
 import numpy as np
 from vestcl import opencl
-from vestcl.models.inference import pretrained
+from vestcl.models import shipped
 opencl.current().kernel("unproject.cl", "unproject", opencl.defines_for(np.dtype(np.float32)))
 print(opencl.kernel_folder())
-print(pretrained.shipped()["vest-s"])
+print(shipped.shipped()["vest-s"])
 """
 
 

@@ -15,7 +15,8 @@ from train.command import ERRORS, failed
 from vestcl import interrupt
 from vestcl.cli import command_line
 from vestcl.models.checkpoint import read_trained_on, write_checkpoint
-from vestcl.models.inference.pretrained import find_model, load_model
+from vestcl.models.forecaster import Forecaster
+from vestcl.models.shipped import find_model
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,14 @@ def export(checkpoint: Path, out: Path) -> None:
     """Write ``out``.
 
     Args:
-        checkpoint: as `vestcl.models.inference.pretrained.load_model` takes it.
+        checkpoint: as `vestcl.models.forecaster.Forecaster.from_pretrained` takes it.
         out: the file.
 
     Raises:
         FileNotFoundError: no such checkpoint.
         ValueError: a damaged one, or weights beyond what float16 holds.
     """
-    model = load_model(checkpoint)
+    model = Forecaster.from_pretrained(checkpoint)
     state = {name: tensor.half() for name, tensor in model.state_dict().items()}
     if beyond := [name for name, tensor in state.items() if not tensor.isfinite().all()]:
         raise ValueError(f"`checkpoint` must have weights below 65,504 for float16, got more in {', '.join(beyond)}")

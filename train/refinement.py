@@ -35,8 +35,8 @@ from vestcl.io import atomic
 from vestcl.models.checkpoint import read_trained_on, write_checkpoint
 from vestcl.models.config import ModelConfig, RefineConfig
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference.pretrained import find_model, load_model
 from vestcl.models.networks.refine import Refine
+from vestcl.models.shipped import find_model
 
 #: Files of a run.
 WEIGHTS: Final = "vest.safetensors"
@@ -225,7 +225,7 @@ class RefinementTraining:
         self.step = 0
 
     def _start_from(self, name: str) -> None:
-        given = load_model(name)
+        given = Forecaster.from_pretrained(name)
         try:
             if not given.refine.of_forecast:
                 raise RuntimeError("its refinement is of splatted clouds")
@@ -334,7 +334,7 @@ def train(config: RefinementConfig, *, resume: bool = False, base: Forecaster | 
         raise ValueError(f"`out` {config.out} has a run already: --resume resumes it, or take another folder")
     if config.run.threads:
         torch.set_num_threads(config.run.threads)
-    training = RefinementTraining(config, base or load_model(config.model))
+    training = RefinementTraining(config, base or Forecaster.from_pretrained(config.model))
     config.out.mkdir(parents=True, exist_ok=True)
     if resume:
         training.restore()

@@ -25,7 +25,6 @@ from vestcl.evaluation import metrics
 from vestcl.evaluation.perceptual import StLpips, squeeze_distance
 from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference.pretrained import load_model
 
 #: (image, truth), [1, 3, H, W] each -> [1].
 Score = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
@@ -99,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command; its exit status."""
     options = command_line.parsed(RefinementScores, "python -m train.refinement_scores", __doc__, arguments)
     try:
-        model, scores, console = load_model(options.model), scores_of(options), Console(width=200)
+        model, scores, console = Forecaster.from_pretrained(options.model), scores_of(options), Console(width=200)
         if not model.refine.of_forecast:
             raise ValueError(
                 f"{options.model}: its refinement is not of geometric forecasts; `train.refinement` makes one"

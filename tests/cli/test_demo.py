@@ -10,9 +10,8 @@ from PIL import Image
 from vestcl.cli import demo
 from vestcl.data import Street, street_clip
 from vestcl.forecasting.views import parse_view
-from vestcl.models import configuration
+from vestcl.models import configuration, shipped
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference import pretrained
 
 
 @pytest.mark.parametrize("model", ["geometric", "vest-s"])
@@ -38,7 +37,7 @@ def test_does_the_whole_job(model: str, tmp_path: Path, capsys: pytest.CaptureFi
 def test_the_shipped_network_is_the_usual_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
     demo.run(tmp_path / "without", height=48, width=160, seed=4, steps=1)
     assert "forecast without any trained weights" in " ".join(capsys.readouterr().out.split())

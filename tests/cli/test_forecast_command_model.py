@@ -15,8 +15,8 @@ from vestcl.cli import main as cli
 from vestcl.data.sample import Clip
 from vestcl.evaluation.compare import ORACLE
 from vestcl.forecasting.files import read_forecast
+from vestcl.models import shipped
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference import pretrained
 
 
 @pytest.fixture
@@ -161,7 +161,7 @@ def test_a_shipped_one_is_told_by_its_name(
     folder: Path, tmp_path: Path, file: Path, network: Repeater, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file.rename(file.with_name("vest-s.safetensors"))
-    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path)
     told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--no-exr", "--frame", "3"]
     assert cli.main([*told, "--model", "vest-s"]) == 0
     settings = read_forecast(tmp_path / "out").about["settings"]
@@ -171,7 +171,7 @@ def test_a_shipped_one_is_told_by_its_name(
 def test_missing_or_damaged_files_are_one_line(
     folder: Path, tmp_path: Path, network: Repeater, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "weights")
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "weights")
     damaged = tmp_path / "damaged.safetensors"
     damaged.write_bytes(b"no tensors")
     for model, message in (

@@ -26,7 +26,6 @@ from vestcl.forecasting.network.learned import CorrectedPaths, corrections, fore
 from vestcl.forecasting.result import LearnedPart, View
 from vestcl.models.config import MOST_CHANGE
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference import pretrained
 
 HEIGHT, WIDTH = 48, 160
 RIGHT = np.eye(4)
@@ -320,7 +319,7 @@ def test_a_network_of_another_interval_is_not_tested() -> None:
 
 def test_the_shipped_network_loads_and_says_why() -> None:
     """vest-s learned to correct constant velocity: with all parts it forecasts as it did, tested it is left out."""
-    shipped = pretrained.load_model("vest-s")
+    shipped = Forecaster.from_pretrained("vest-s")
     assert shipped.config.prior == "velocity" and shipped.config.ego_motion is not None
     assert shipped.config.ego_motion.correction == "linear"
     found = parts(shipped)

@@ -27,7 +27,7 @@ from vestcl.forecasting.network.input import last_motions, network_input
 from vestcl.forecasting.result import View
 from vestcl.io.images import to_pixels
 from vestcl.models.config import configuration
-from vestcl.models.inference import pretrained
+from vestcl.models.forecaster import Forecaster
 from vestcl.prepare.clip import EightBitPerception, frame_keys, prepare_clip
 from vestcl.prepare.frame import prepare_frame
 from vestcl.prepare.prepared import PreparedClip
@@ -152,7 +152,7 @@ def test_the_prior_is_per_interval() -> None:
 
 def test_another_interval_than_the_networks() -> None:
     """vest-s learned at 10 Hz: its corrections of motion are left out, and a line says so."""
-    model = pretrained.load_model("vest-s")
+    model = Forecaster.from_pretrained("vest-s")
     clip = dataclasses.replace(fine(), samples=fine().samples[:4]).resized(48, 160)
     made = network.forecast_frames(Perception(clip), model, 3, 2, [SOURCE], learned="all")
     measured = [np.linalg.inv(Perception(clip).prev_from_cur(index)) for index in (2, 3)]

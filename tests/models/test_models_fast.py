@@ -26,7 +26,6 @@ from vestcl.models.inference.fast import (
     accelerate,
     share_frames,
 )
-from vestcl.models.inference.pretrained import load_model
 from vestcl.models.inference.skipping import NOTHING
 from vestcl.models.networks.object_motion import MotionConv
 
@@ -96,7 +95,7 @@ def test_bfloat16_is_near() -> None:
 
 
 def test_the_shipped_network() -> None:
-    model, given, prior = load_model("vest-s"), arguments(1, 64, 96), turning(1, 64, 96)
+    model, given, prior = Forecaster.from_pretrained("vest-s"), arguments(1, 64, 96), turning(1, 64, 96)
     with torch.no_grad():
         wanted = image(model(*given, prior=prior))
     assert (image(accelerate(model)(*given, prior=prior)) - wanted).abs().max() <= CLOSE

@@ -7,9 +7,9 @@ import pytest
 import torch
 from forecaster_scenes import TINY
 
+from vestcl.models import shipped
 from vestcl.models.checkpoint import write_checkpoint
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference import pretrained
 
 #: The most that a file in the package may have, bytes.
 LARGEST = 20e6
@@ -29,58 +29,58 @@ def test_a_file(model: Forecaster, tmp_path: Path) -> None:
     path = tmp_path / "mine.safetensors"
     model.save(path)
     for given in (path, str(path)):
-        loaded = pretrained.load_model(given)
+        loaded = Forecaster.from_pretrained(given)
         assert same(loaded, model) and loaded.config == TINY and not loaded.training
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    assert pretrained.about_model(path) == {"model_file": str(path), "model_sha256": sha256}
+    assert shipped.about_model(path) == {"model_file": str(path), "model_sha256": sha256}
 
 
 def test_of_a_checkpoint_the_running_mean(model: Forecaster, tmp_path: Path) -> None:
     folder, mean = tmp_path / "step-00000012", Forecaster(TINY)
     model.save(folder / "model.safetensors")
-    assert same(pretrained.load_model(folder), model)
+    assert same(Forecaster.from_pretrained(folder), model)
     mean.save(folder / "ema.safetensors")
     assert not same(mean, model)
-    assert same(pretrained.load_model(str(folder)), mean)
-    assert pretrained.find_model(folder) == folder / "ema.safetensors"
+    assert same(Forecaster.from_pretrained(str(folder)), mean)
+    assert shipped.find_model(folder) == folder / "ema.safetensors"
 
 
 def test_half_precision_is_loaded_as_float32(model: Forecaster, tmp_path: Path) -> None:
     path, half = tmp_path / "half.safetensors", {name: t.half() for name, t in model.state_dict().items()}
     write_checkpoint(path, TINY, half)
-    loaded = pretrained.load_model(path).state_dict()
+    loaded = Forecaster.from_pretrained(path).state_dict()
     assert {tensor.dtype for tensor in loaded.values()} == {torch.float32}
     assert all(torch.equal(loaded[name], half[name].float()) for name in half)
 
 
 def test_by_name(model: Forecaster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path)
     monkeypatch.chdir(tmp_path)
-    assert pretrained.shipped() == {}
+    assert shipped.shipped() == {}
     with pytest.raises(ValueError, match=r"vest-s: its weights are missing \(.*vest-s.safetensors\); install vestcl"):
-        pretrained.load_model("vest-s")
+        Forecaster.from_pretrained("vest-s")
     path = tmp_path / "vest-s.safetensors"
     model.save(path)
-    assert pretrained.shipped() == {"vest-s": path}
-    assert same(pretrained.load_model("vest-s"), model)
-    assert pretrained.about_model("vest-s")["model_file"] == "vest-s.safetensors"
+    assert shipped.shipped() == {"vest-s": path}
+    assert same(Forecaster.from_pretrained("vest-s"), model)
+    assert shipped.about_model("vest-s")["model_file"] == "vest-s.safetensors"
     with pytest.raises(ValueError, match="is no model"):  # a path is no name
-        pretrained.load_model(Path("vest-s"))
+        Forecaster.from_pretrained(Path("vest-s"))
 
 
 def test_errors(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="vest-xl: is no model: no file, no checkpoint's folder, and none of vest-s"):
-        pretrained.load_model("vest-xl")
+        Forecaster.from_pretrained("vest-xl")
     with pytest.raises(ValueError, match=r"must have ema.safetensors or model.safetensors, as a training checkpoint"):
-        pretrained.load_model(tmp_path)
+        Forecaster.from_pretrained(tmp_path)
     (tmp_path / "torn.safetensors").write_bytes(b"12345678torn")
     with pytest.raises(ValueError, match=r"must be a safetensors file, got .*torn"):
-        pretrained.load_model(tmp_path / "torn.safetensors")
+        Forecaster.from_pretrained(tmp_path / "torn.safetensors")
 
 
-@pytest.mark.parametrize("name", pretrained.SHIPPED)
+@pytest.mark.parametrize("name", shipped.SHIPPED)
 def test_what_ships(name: str) -> None:
-    model = pretrained.load_model(name)
+    model = Forecaster.from_pretrained(name)
     assert model.config.name.split("+")[0] == name
     assert all(torch.isfinite(parameter).all() for parameter in model.parameters())
-    assert pretrained.shipped()[name].stat().st_size <= LARGEST
+    assert shipped.shipped()[name].stat().st_size <= LARGEST

@@ -12,7 +12,7 @@ from vestcl.bench.pareto.measure import step
 from vestcl.bench.pareto.scenes import Scene, scene
 from vestcl.evaluation import metrics
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference import pretrained, quality
+from vestcl.models.inference import quality
 from vestcl.models.inference.effort import Effort
 from vestcl.models.inference.fast import computes_bfloat16
 from vestcl.models.inference.quality import LEVELS, LOSS, Quality
@@ -35,13 +35,13 @@ def scenes() -> list[Scene]:
 @pytest.fixture(scope="module")
 def exact(scenes: list[Scene]) -> list[torch.Tensor]:
     """As the shipped network forecasts the streets when it is loaded."""
-    model = pretrained.load_model("vest-s")
+    model = Forecaster.from_pretrained("vest-s")
     return [step(model, one.given) for one in scenes]
 
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_the_shipped_network_keeps_the_bound(level: Quality, scenes: list[Scene], exact: list[torch.Tensor]) -> None:
-    model = pretrained.load_model("vest-s")
+    model = Forecaster.from_pretrained("vest-s")
     assert quality.apply(model, level) is model
     losses = []
     for one, before in zip(scenes, exact, strict=True):

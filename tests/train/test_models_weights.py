@@ -19,7 +19,6 @@ from vestcl.evaluation.perceptual import Lpips, VggLoss
 from vestcl.evaluation.trunks.trunks import Trunk, load_trunk
 from vestcl.models.checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference import pretrained
 from vestcl.models.inference.fast import accelerate
 from vestcl.models.networks.encoder import Encoder, load_resnet34
 from vestcl.models.weights_file import read_state_dict, unwrapped
@@ -56,7 +55,7 @@ def write_npz(path: Path, state: State) -> None:
 
 def of_forecaster(state: State, folder: Path) -> State:
     write_checkpoint(folder / "m.safetensors", TINY, state)
-    return pretrained.load_model(folder / "m.safetensors").state_dict()
+    return Forecaster.from_pretrained(folder / "m.safetensors").state_dict()
 
 
 def of_checkpoint(state: State, folder: Path) -> State:

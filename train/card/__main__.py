@@ -32,7 +32,7 @@ from vestcl import interrupt
 from vestcl.cli import command_line
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.checkpoint import read_checkpoint
-from vestcl.models.inference.pretrained import find_model
+from vestcl.models.shipped import find_model
 
 #: Rows of the log that is kept beside the card: a curve of some hundred pixels has no use for more.
 LOG_ROWS: Final = 300

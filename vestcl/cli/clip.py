@@ -61,8 +61,8 @@ def open_clip(
             raise ValueError(f"{text}: must have no depth and masks here; `vestcl prepare` takes them")
         return with_estimates(_street(street.seeds[0], street.driven, street_frames, size), estimators)
     checks.check_folders(options)
-    clip = _resized(open_sequence(text, **files, **layout), *size)
-    return with_estimates(clip, estimators)
+    check_pixels(*size)
+    return with_estimates(open_sequence(text, **files, **layout).fitted(*size), estimators)
 
 
 def _street(seed: int, driven: street_input.Driven, frames: int, size: tuple[int | None, int | None]) -> Clip:
@@ -72,20 +72,6 @@ def _street(seed: int, driven: street_input.Driven, frames: int, size: tuple[int
         return street_clip(made, frames, height, width)
     fps = float(driven.drawn(seed).fps or street_input.USUAL_RATE)
     return street_clip(made, frames, height, width, start=start, fps=fps)
-
-
-def _resized(clip: Clip, height: int | None, width: int | None) -> Clip:
-    """The clip at another size; a side that is not told follows the other."""
-    if height is None and width is None:
-        return clip
-    sample = clip[0]
-    if height is None and width is not None:
-        height = max(1, round(sample.height * width / sample.width))
-    elif width is None and height is not None:
-        width = max(1, round(sample.width * height / sample.height))
-    assert height is not None and width is not None
-    check_pixels(height, width)
-    return clip.resized(height, width)
 
 
 def load_estimators(depth_model: str | None, mask_model: str | None) -> Estimators:

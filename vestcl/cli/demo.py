@@ -33,8 +33,9 @@ from vestcl.forecasting.views import parse_views
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.contact_sheet import Cell
 from vestcl.io.images import write_pixels
+from vestcl.models import shipped
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference import pretrained, quality
+from vestcl.models.inference import quality
 
 #: Frames up to the current one, all that the forecast looks at, and the rate, frames a second.
 CONTEXT, FPS = 4, 10.0
@@ -73,7 +74,7 @@ def run(
         height: rows of the pictures.
         width: columns of the pictures.
         seed: of the street.
-        model: NETWORK or any other that `vestcl.models.inference.pretrained.load_model` knows, or GEOMETRIC; None is
+        model: NETWORK or any other that `Forecaster.from_pretrained` knows, or GEOMETRIC; None is
             NETWORK where this installation has it, else GEOMETRIC.
         level: how exactly the network computes.
         steps: frames to forecast.
@@ -81,7 +82,7 @@ def run(
     Raises:
         ValueError: no such model.
     """
-    name = model or (NETWORK if NETWORK in pretrained.shipped() else GEOMETRIC)
+    name = model or (NETWORK if NETWORK in shipped.shipped() else GEOMETRIC)
     forecaster = None if name == GEOMETRIC else quality.load(name, level)
     console, street = Console(), Street.generate(seed)
     clip = street_clip(street, CONTEXT + steps, height, width, start=START, fps=FPS, samples=SAMPLES)
@@ -98,7 +99,7 @@ def run(
         sheets = {view.name: forecast_sheet([frame[view.name] for frame in forecast.frames]) for view in views}
         settings: dict[str, Any] = {"height": height, "width": width, "model": name}
         if forecaster is not None:
-            settings |= {"mode": forecaster.config.default_mode, **pretrained.about_model(name), **quality.about(level)}
+            settings |= {"mode": forecaster.config.default_mode, **shipped.about_model(name), **quality.about(level)}
         about = forecast_files.Details(f"street:{seed}", settings, scores, sheets)
         forecast_files.write_forecast(out, forecast, seen, index, views, about)
         write_pixels(out / "sheet.png", _sheet(perception, index, forecast, truth))

@@ -29,7 +29,8 @@ from vestcl.forecasting.network.later_frames import LaterFrames, later_frames
 from vestcl.forecasting.result import Forecast, SkippedWork, View
 from vestcl.forecasting.sheets import forecast_sheet
 from vestcl.forecasting.views import parse_views
-from vestcl.models.inference import pretrained, quality
+from vestcl.models import shipped
+from vestcl.models.inference import quality
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 
 if TYPE_CHECKING:
@@ -234,7 +235,7 @@ def _details(
     if options.model is not None and later is not None:
         chosen = {**later.settings, **quality.about(options.quality or quality.USUAL)}
         chosen["learned"] = options.learned or DEFAULT_LEARNED
-        settings |= chosen | pretrained.about_model(options.model)
+        settings |= chosen | shipped.about_model(options.model)
     return forecast_files.Details(options.input, settings, scores, sheets)
 
 

@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: the command line; None takes the process's own.
     """
-    from vestcl import __version__
+    from vestcl._version import __version__
     from vestcl.cli import command_line
 
     given = list(sys.argv[1:] if arguments is None else arguments)

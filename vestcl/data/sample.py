@@ -255,6 +255,10 @@ class Clip(Sequence[Sample]):
     def __len__(self) -> int:
         return len(self.samples)
 
+    def __repr__(self) -> str:
+        first, rate = self.samples[0], "" if self.fps is None else f" at {self.fps:g} Hz"
+        return f"Clip({self.name}, {self.kind}, {len(self)} frames of {first.height} x {first.width} px{rate})"
+
     @overload
     def __getitem__(self, index: int) -> Sample: ...
     @overload
@@ -327,6 +331,18 @@ class Clip(Sequence[Sample]):
     def resized(self, height: int, width: int) -> "Clip":
         """All samples at another size, see `Sample.resized`."""
         return self._mapped(sample.resized(height, width) for sample in self)
+
+    def fitted(self, height: int | None, width: int | None) -> "Clip":
+        """At a height, a width or both; the other side follows in proportion. Without either the clip itself."""
+        if height is None and width is None:
+            return self
+        sample = self.samples[0]
+        if height is None and width is not None:
+            height = max(1, round(sample.height * width / sample.width))
+        elif width is None and height is not None:
+            width = max(1, round(sample.width * height / sample.height))
+        assert height is not None and width is not None
+        return self.resized(height, width)
 
     def from_first_pose(self) -> "Clip":
         """The same clip with the first camera as world: first_from_world world_from_cam; without poses, itself."""

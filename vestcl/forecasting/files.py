@@ -25,7 +25,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vestcl import __version__, opencl
+from vestcl import opencl
+from vestcl._version import __version__
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
 from vestcl.forecasting.result import Forecast, Rendered, View
@@ -234,14 +235,23 @@ def _write_frames(out: Path, forecast: Forecast, view: str, exr: bool) -> dict[s
     return {"frames": frames}
 
 
-def _write_videos(
-    out: Path, forecast: Forecast, clip: Clip, index: int, view: View, fps: float, gif: bool
-) -> dict[str, Any]:
+def video_images(forecast: Forecast, clip: Clip, index: int, view: View) -> tuple[int, list[NDArray[np.uint8]]]:
+    """What a view's video shows: in the source camera the last CONTEXT frames up to t first, then the forecast.
+
+    Returns:
+        How many frames come first, and all as [H, W, 3] uint8.
+    """
     past = clip[max(0, index + 1 - CONTEXT) : index + 1] if isinstance(seen_by(view, clip[index]), Sample) else ()
     context = [sample.read_image() for sample in past]
     images = [*context, *(rendered.image for rendered in _of_view(forecast, view.name))]
-    pixels = [to_pixels(image).astype(np.uint8, copy=False) for image in images]
-    files: dict[str, Any] = {"context_frames": len(context), "video": f"{view.name}/forecast.mp4"}
+    return len(context), [to_pixels(image).astype(np.uint8, copy=False) for image in images]
+
+
+def _write_videos(
+    out: Path, forecast: Forecast, clip: Clip, index: int, view: View, fps: float, gif: bool
+) -> dict[str, Any]:
+    context, pixels = video_images(forecast, clip, index, view)
+    files: dict[str, Any] = {"context_frames": context, "video": f"{view.name}/forecast.mp4"}
     K = clip[index].K if view.K is None else view.K
     write_mp4(out / files["video"], pixels, fps, pixel_aspect=K[1, 1] / K[0, 0])
     if gif:

@@ -1,14 +1,18 @@
 """The whole network: two frames in, future frames out, from any camera."""
 
+import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Any, Final, get_args
 
 import torch
+from huggingface_hub import ModelHubMixin, hf_hub_download
+from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError
 
 from vestcl.models.checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models.config import Mode
 from vestcl.models.inference.skipping import current_tally
+from vestcl.models.shipped import find_model
 from vestcl.models.stages import Stages
 from vestcl.models.steps.clouds import Cloud, advance
 from vestcl.models.steps.frames import check_frames
@@ -34,8 +38,43 @@ __all__ = [
 
 Views = Sequence[tuple[torch.Tensor, torch.Tensor]]
 
+#: A model's file in a folder that `Forecaster.save_pretrained` writes.
+WEIGHTS: Final = "model.safetensors"
 
-class Forecaster(Stages):
+#: A repository on a hub: OWNER/NAME.
+_REPOSITORY: Final = re.compile(r"[\w.-]+/[\w.-]+")
+
+_CARD: Final = """---
+# Metadata: https://huggingface.co/docs/hub/model-cards
+{{ card_data }}
+---
+
+# A vestcl network
+
+It forecasts future frames of a driving video and shows them from any camera (video extrapolation in space and time).
+`model.safetensors` holds weights and configuration; `config.json` repeats the configuration.
+
+```python
+import vestcl
+
+model = vestcl.Forecaster.from_pretrained("THIS FOLDER OR REPOSITORY")
+future = vestcl.forecast(vestcl.open("drive.mp4", fov=60), model=model)
+```
+
+The licence above is the licence of the file of weights. Trained as in Yarram and Yuan, "Forecasting Future Videos from
+Novel Views via Disentangled 3D Scene Representation", ECCV 2024.
+"""
+
+
+class Forecaster(
+    Stages,
+    ModelHubMixin,
+    library_name="vestcl",
+    license="apache-2.0",
+    pipeline_tag="image-to-image",
+    tags=["video-prediction", "novel-view-synthesis", "driving"],
+    model_card_template=_CARD,
+):
     """Encode, lift, forecast the camera's and then the objects' motion, displace, splat, refine.
 
     Both input frames become a cloud each: every pixel, and where foreground hides the background that is inpainted
@@ -210,6 +249,30 @@ class Forecaster(Stages):
             ValueError: the folder can't be made.
         """
         write_checkpoint(path, self.config, self.state_dict())
+
+    @classmethod
+    def from_pretrained(cls, name: Path | str, **options: Any) -> "Forecaster":  # type: ignore[override]
+        """A trained network, in evaluation mode, on the CPU, in float32 in whatever precision its file is.
+
+        Args:
+            name: "vest-s", which ships with vestcl; a .safetensors file; a folder that `save_pretrained` or training
+                wrote; or a repository on a hub, "OWNER/NAME".
+            **options: of `huggingface_hub.hf_hub_download`, for repositories: ``revision``, ``token`` ...
+
+        Raises:
+            ValueError: no such name, file, folder or repository; a damaged file, or weights that don't fit their
+                configuration.
+        """
+        if isinstance(name, str) and _REPOSITORY.fullmatch(name) and not Path(name).exists():
+            try:
+                return cls.load(hf_hub_download(name, WEIGHTS, **options))
+            except (HfHubHTTPError, EntryNotFoundError, OSError) as error:
+                reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+                raise ValueError(f"{name}: is no file here, and can't be had from the hub: {reason}") from error
+        return cls.load(find_model(name))
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        self.save(save_directory / WEIGHTS)
 
     @classmethod
     def load(cls, path: Path | str) -> "Forecaster":

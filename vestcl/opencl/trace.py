@@ -22,7 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from vestcl import __version__, opencl
+from vestcl import opencl
+from vestcl._version import __version__
 from vestcl.io import atomic
 
 #: Nanoseconds after which a device's clock is compared with the host's again: clocks drift by tens of ppm, which is

@@ -17,7 +17,8 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from vestcl import __version__, doctor, opencl
+from vestcl import doctor, opencl
+from vestcl._version import __version__
 from vestcl.bench.common import plots
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.table import Better, Section, long_table, show_grid

@@ -16,7 +16,9 @@ from vestcl.bench.pareto import plots
 from vestcl.bench.pareto.knobs import EXACT, Setting, combinations, describe, knobs, setting_of
 from vestcl.bench.pareto.measure import PRICE, Bench, Point, front, knee, measure, recursions
 from vestcl.bench.pareto.scenes import scene
-from vestcl.models.inference import pretrained, quality
+from vestcl.models import shipped
+from vestcl.models.forecaster import Forecaster
+from vestcl.models.inference import quality
 from vestcl.models.inference.fast import accelerate
 
 #: Horizons at which the two ways to forecast several steps are compared.
@@ -66,7 +68,7 @@ def main(config: ParetoBench) -> None:
     _results.check_positive(config, "height", "width", "runs", "threads")
     if not config.seeds:
         raise ValueError("`seeds` must be one or more streets, got none")
-    pretrained.find_model(config.model)
+    shipped.find_model(config.model)
     with _timing.recycling_allocator():
         results = _results.run("pareto", config, partial(_measure, config))
     if config.plots is not None:
@@ -75,13 +77,13 @@ def main(config: ParetoBench) -> None:
 
 
 def _measure(config: ParetoBench, _: opencl.Session, console: Console) -> Iterator[Section]:
-    model, details = pretrained.load_model(config.model), dict[str, Any]()
+    model, details = Forecaster.from_pretrained(config.model), dict[str, Any]()
     with console.status("streets, and the exact forecast in float64"):
         steps = max(HORIZONS) if config.recursion else 1
         scenes = [scene(seed, config.height, config.width, steps) for seed in config.seeds]
         bench = Bench(model, scenes, config.runs)
     bench.model = accelerate(model) if config.accelerated else model
-    yield Section("", [], details={"price": PRICE, "model": pretrained.about_model(config.model)})
+    yield Section("", [], details={"price": PRICE, "model": shipped.about_model(config.model)})
     with _timing.watching_others() as others:
         best: list[list[Setting]] = []
         for knob in knobs(model):

@@ -17,7 +17,7 @@ from vestcl.bench.common.timing import peak_gigabytes
 from vestcl.bench.pipeline.measure import ALL, COPY, INPAINT, NONE, PEER, Record, measure_scene
 from vestcl.bench.pipeline.traffic import EMPTY, EVERYTHING, JAM, LEAST_FRAMES, TRAFFIC, drive
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference import pretrained, quality
+from vestcl.models.inference import quality
 from vestcl.models.inference.fast import accelerate
 from vestcl.models.inference.skipping import Count
 from vestcl.models.networks import voxel_flow
@@ -80,7 +80,7 @@ def load(config: PipelineBench) -> Forecaster:
     Raises:
         ValueError: no such model.
     """
-    model = quality.apply(pretrained.load_model(config.model), config.quality)
+    model = quality.apply(Forecaster.from_pretrained(config.model), config.quality)
     if config.precision is not None:
         model.autocast = torch.bfloat16 if config.precision == "bfloat16" else None
     if not config.accelerated:

@@ -16,9 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-import vestcl
 from vestcl import constants
 from vestcl.forecasting.result import Rendered
+from vestcl.ops.displace import displace
+from vestcl.ops.splat import splat
 
 #: A point's radius in pixels of the source, and its limits in the target: for colour shown directly 0.9 to 1.0 is
 #: best (SPEC section 2); 1.2 loses 0.15 dB on KITTI at t+1.
@@ -150,7 +151,7 @@ def _splat(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """image [7, L], divided by coverage, and coverage [M]."""
     still = np.zeros((1, *cloud.points_xyz.shape), np.float32)
-    points_uv, z = vestcl.displace(
+    points_uv, z = displace(
         cloud.points_xyz[None], still, K[None].astype(np.float32), tgt_from_next[None].astype(np.float32)
     )
     if wanted.covered is not None:
@@ -161,7 +162,7 @@ def _splat(
     radii = np.clip(RHO * stretch, *RADIUS_LIMITS)[None]
     opacities = (whole & (RHO * zoom <= RADIUS_LIMITS[1]))[None].astype(np.float32)
     size = wanted.height, wanted.width
-    image, coverage = vestcl.splat(points_uv, z, radii, opacities, _features(cloud, uv, z[0], whole)[None], *size)
+    image, coverage = splat(points_uv, z, radii, opacities, _features(cloud, uv, z[0], whole)[None], *size)
     composite, covered, pixels = image[0].transpose(1, 2, 0).reshape(-1, 16), coverage.ravel(), wanted.of_view()
     mean = _transposed(composite if pixels is None else composite[pixels])
     mean /= np.maximum(covered if pixels is None else covered[pixels], np.float32(1e-6))

@@ -10,17 +10,14 @@
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, get_args
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import torch
 
-from vestcl.models.inference import pretrained
+from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.effort import Effort
 from vestcl.models.inference.fast import FastForecaster, accelerate, computes_bfloat16, keep_freed_memory
 from vestcl.models.inference.skipping import Skip
-
-if TYPE_CHECKING:
-    from vestcl.models.forecaster import Forecaster
 
 Quality = Literal["exact", "balanced", "fast"]
 
@@ -81,7 +78,7 @@ def about(quality: Quality) -> dict[str, Any]:
     return {"quality": quality, "skip": asdict(skip), "effort": asdict(effort), "autocast": autocast}
 
 
-def apply(model: "Forecaster", quality: Quality) -> "Forecaster":
+def apply(model: Forecaster, quality: Quality) -> Forecaster:
     """Let ``model`` forecast at ``quality`` from now on; its weights stay as they are.
 
     bfloat16 is for processors that compute in it: elsewhere it costs time, and float32 stays. Where the network paints
@@ -109,7 +106,7 @@ def load(name_or_path: str | Path, quality: Quality) -> FastForecaster:
     """A trained network as commands use it: at ``quality``, laid out for inference; the process keeps what it frees.
 
     Args:
-        name_or_path: see `vestcl.models.inference.pretrained.load_model`.
+        name_or_path: see `vestcl.models.forecaster.Forecaster.from_pretrained`.
         quality: one of `LEVELS`.
 
     Raises:
@@ -117,5 +114,5 @@ def load(name_or_path: str | Path, quality: Quality) -> FastForecaster:
         ValueError: no such model, a damaged file, or another word.
     """
     keep_freed_memory()
-    model = apply(pretrained.load_model(name_or_path), quality)
+    model = apply(Forecaster.from_pretrained(name_or_path), quality)
     return accelerate(model, "float32" if model.autocast is None else "bfloat16")

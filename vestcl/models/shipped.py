@@ -1,17 +1,14 @@
-"""Trained networks: those that ship with the package, and anyone's own, by one name or path."""
+"""The files of trained networks: those that ship with the package, and anyone's own, by one name or path."""
 
 import hashlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:  # names and files are known without torch, which takes seconds to import
-    from vestcl.models.forecaster import Forecaster
+from typing import Final
 
 #: What this version ships with, each NAME as FOLDER/NAME.safetensors.
 SHIPPED: Final = ("vest-s",)
 
 #: In a wheel, an editable install and a bare checkout alike.
-FOLDER: Final = Path(__file__).resolve().parents[2] / "weights"
+FOLDER: Final = Path(__file__).resolve().parents[1] / "weights"
 
 #: What of a training checkpoint's folder is taken, the first that is there: the running mean forecasts better.
 _OF_A_CHECKPOINT: Final = ("ema.safetensors", "model.safetensors")
@@ -24,7 +21,7 @@ def shipped() -> dict[str, Path]:
 
 
 def find_model(name_or_path: str | Path) -> Path:
-    """The file that `load_model` reads.
+    """The file that `Forecaster.from_pretrained` reads.
 
     Args:
         name_or_path: one of SHIPPED; or a .safetensors file; or the folder of a training checkpoint, whose
@@ -50,20 +47,6 @@ def find_model(name_or_path: str | Path) -> Path:
     if not path.is_file():
         raise ValueError(f"{path}: is no model: no file, no checkpoint's folder, and none of {', '.join(SHIPPED)}")
     return path
-
-
-def load_model(name_or_path: str | Path) -> "Forecaster":
-    """A trained network, in evaluation mode, on the CPU, in float32 in whatever precision its file is.
-
-    Args:
-        name_or_path: as of `find_model`.
-
-    Raises:
-        ValueError: as `find_model`; a damaged file, one without a configuration, or weights that don't fit it.
-    """
-    from vestcl.models.forecaster import Forecaster
-
-    return Forecaster.load(find_model(name_or_path))
 
 
 def about_model(name_or_path: str | Path) -> dict[str, str]:

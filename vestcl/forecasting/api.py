@@ -1,0 +1,148 @@
+"""The Python interface: `vestcl.open` a drive, `vestcl.forecast` its future, look at it, save it.
+
+clip = vestcl.open("drive.mp4", fov=60)
+future = vestcl.forecast(clip, steps=5, views=["source", "right"], model="vest-s")
+future["right"][3].image          # [3, H, W], the frame at t+3 as the right camera sees it
+future.save("out")
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from vestcl.data import street_clip
+from vestcl.data.open import open_sequence
+from vestcl.data.sample import Clip
+from vestcl.data.street import input as street_input
+from vestcl.forecasting.future import Future
+from vestcl.forecasting.result import Forecast, View
+from vestcl.forecasting.views import parse_views
+
+if TYPE_CHECKING:
+    from vestcl.models.forecaster import Forecaster
+
+#: Frames of a street if no number is asked for, and its size (height, width), px.
+STREET_FRAMES: Final = 12
+STREET_SIZE: Final = (256, 832)
+
+Progress = Callable[[str, float], None]
+"""Called with the stage and the share of the work that is done, 0 to 1."""
+
+
+def open(
+    source: str | Path,
+    *,
+    height: int | None = None,
+    width: int | None = None,
+    frames: int | None = None,
+    **options: Any,
+) -> Clip:
+    """Open a driving clip of any kind; nothing is read before it is needed.
+
+    Args:
+        source: a KITTI raw drive, a KITTI odometry sequence, a frame of Cityscapes, a scene of Virtual KITTI 2, a
+            folder with camera.json, a video, or "street:SEED" for a procedural street, which needs no file.
+        height: px; None is as the clip is, or in proportion to ``width``.
+        width: px, alike.
+        frames: of a street, STREET_FRAMES if not given.
+        **options: of the reader, as `vestcl forecast` has them: ``fov`` (degrees) of a video, ``depth``, ``labels``,
+            ``rig``, ``sequence`` ... (`vestcl.data.open.open_sequence`).
+
+    Returns:
+        Its frames in order; ``clip[3]`` is a frame, ``clip[3:8]`` a clip.
+
+    Raises:
+        ValueError: nothing there that vestcl can open, or an option that this kind of clip does not have.
+    """
+    text = str(source)
+    street = street_input.parse(text)
+    if street is not None and street.seeds is not None:
+        if options:
+            raise ValueError(f"{text}: is a street, which takes height, width, frames, not {', '.join(options)}")
+        return _street(street.seeds[0], street.driven, frames or STREET_FRAMES, height, width)
+    if frames is not None:
+        raise ValueError(f"`frames` is of streets, got {frames} for {text}; take a slice of the clip, clip[:{frames}]")
+    return open_sequence(source, **options).fitted(height, width)
+
+
+def _street(seed: int, driven: street_input.Driven, frames: int, height: int | None, width: int | None) -> Clip:
+    made, start = street_input.street(seed, driven)
+    fps = float(driven.drawn(seed).fps or street_input.USUAL_RATE)
+    size = (height or STREET_SIZE[0], width or STREET_SIZE[1])
+    return street_clip(made, frames, *size, start=start, fps=fps)
+
+
+def forecast(
+    clip: Clip | str | Path,
+    frame: int | None = None,
+    *,
+    steps: int = 5,
+    views: str | Iterable[str | View] = ("source",),
+    model: "str | Path | Forecaster | None" = None,
+    quality: Literal["exact", "balanced", "fast"] = "balanced",
+    progress: Progress | None = None,
+    **how: Any,
+) -> Future:
+    """Forecast the frames after one frame of a clip, and show them from any camera.
+
+    Args:
+        clip: what `open` gave, or anything that it opens.
+        frame: the current frame t, from 0, which has one before it; later frames are not looked at. None is the last.
+        steps: frames to forecast; step k is the clip's interval times k after t.
+        views: cameras: "source", "right", "left", "x,y,z,yaw=,pitch=,roll=,fov=,name=" (`vestcl.forecasting.views`),
+            or `View`.
+        model: None forecasts by geometry only; else a network: "vest-s", a file, a training checkpoint's folder, or a
+            `Forecaster`.
+        quality: the inference preset of a network that is loaded here.
+        progress: called with the stage and the share of the work that is done.
+        **how: ``memory`` and ``inpaint`` of `vestcl.forecasting.geometric.forecast_clip`, ``mode``, ``perceive``,
+            ``learned`` and ``inpaint`` of `vestcl.forecasting.network.forecast.forecast_clip`.
+
+    Returns:
+        The future: ``future["right"][3].image``.
+
+    Raises:
+        ValueError: no such frame or none before it, no steps, no such view or model; the message names the argument.
+
+    Source: Yarram and Yuan, ECCV 2024; SPEC sections 2 to 6.
+    """
+    clip = clip if isinstance(clip, Clip) else open(clip)
+    index = len(clip) - 1 if frame is None else frame
+    if not 1 <= index < len(clip):
+        got = f"{len(clip)} frames" if frame is None else str(frame)
+        raise ValueError(f"`frame` must be 1 ... {len(clip) - 1}, to have a frame before it, got {got}")
+    cameras = _cameras(views, clip, index)
+    return Future(clip, index, tuple(cameras), _made(clip, index, steps, cameras, model, quality, progress, how))
+
+
+def _cameras(views: str | Iterable[str | View], clip: Clip, index: int) -> list[View]:
+    given = [views] if isinstance(views, str | View) else list(views)
+    if not given:
+        raise ValueError("`views` must be one camera or more, got none")
+    parsed = iter(parse_views([view for view in given if isinstance(view, str)], clip[index]))
+    found = [view if isinstance(view, View) else next(parsed) for view in given]
+    names = [view.name for view in found]
+    if len(set(names)) < len(names):
+        raise ValueError(f"`views` must have a name of their own each, got {', '.join(names)}")
+    return found
+
+
+def _made(
+    clip: Clip,
+    index: int,
+    steps: int,
+    views: Sequence[View],
+    model: "str | Path | Forecaster | None",
+    quality: Literal["exact", "balanced", "fast"],
+    progress: Progress | None,
+    how: dict[str, Any],
+) -> Forecast:
+    if model is None:
+        from vestcl.forecasting import geometric
+
+        return geometric.forecast_clip(clip, index, steps, views, progress=progress, **how)
+    from vestcl.forecasting.network import forecast as network
+    from vestcl.models.inference import quality as presets
+
+    network_model = presets.load(model, quality) if isinstance(model, str | Path) else model
+    return network.forecast_clip(clip, index, steps, views, network_model, progress=progress, **how)
