@@ -64,6 +64,25 @@ inline REAL4 sum_lanes_of_four(const vector_t* v) {
 }
 #endif
 
+// Lane j of vector i becomes lane i of vector j: each round of shuffles interleaves vectors half of them apart.
+inline void transpose(vector_t* vectors) {
+#if VECTOR > 1
+#pragma unroll
+  for (int rounds = VECTOR; rounds > 1; rounds /= 2) {
+    vector_t next[VECTOR];
+#pragma unroll
+    for (int i = 0; i < VECTOR / 2; i++) {
+      next[2 * i].even = vectors[i].lo;
+      next[2 * i].odd = vectors[i + VECTOR / 2].lo;
+      next[2 * i + 1].even = vectors[i].hi;
+      next[2 * i + 1].odd = vectors[i + VECTOR / 2].hi;
+    }
+#pragma unroll
+    for (int i = 0; i < VECTOR; i++) vectors[i] = next[i];
+  }
+#endif
+}
+
 inline void copy_row(global const REAL* row, vector_t* blocks) {
 #pragma unroll
   for (int k = 0; k < BLOCKS; k++) blocks[k] = *(global const loose_vector_t*)(row + BLOCK_START(k));

@@ -225,7 +225,7 @@ inline void walk_back(
 kernel void composite_tiles_backward(
     const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
     const int x0, const int y0, const int step_x, const int step_y,
-    const long pixel_stride, const long channel_stride,
+    const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
     global const int* restrict tile_starts,         // [B * tiles + 1]
     global const record_t* restrict records,        // [E]
     global const REAL* restrict features,           // [P, C]
@@ -253,7 +253,10 @@ kernel void composite_tiles_backward(
 #endif
 
   // Forward, keeping the first transmittances of every segment but the first.
-  gradient_ahead_t ahead = gradient_ahead(tile, height, width, channel_stride, grad_image);
+  const strides_t strides = {image_stride, row_stride, pixel_stride, channel_stride};
+  global const REAL* corner =
+      grad_image + tile.b * strides.image + tile.top * strides.row + tile.left * strides.pixel;
+  gradient_ahead_t ahead = gradient_ahead(tile, strides, corner);
   walk_t walk;
   for (int p = 0; p < ROOM; p++) walk.transmittance[p] = 1;
   int segment = 0, first = begin;
@@ -267,7 +270,7 @@ kernel void composite_tiles_backward(
 
   for (int e = max(stop - AHEAD, first); e < stop; e++) read_ahead(records, e, features);
   vector_t g[ROOM][BLOCKS];
-  load_grad_image(g, tile, height, width, pixel_stride, channel_stride, grad_image);
+  load_grad_image(g, tile, strides, corner);
 #if GRAD_BACKGROUNDS
   sum_background(g, walk.transmittance, tile, tile_grad_backgrounds + (size_t)index * CHANNELS);
 #endif

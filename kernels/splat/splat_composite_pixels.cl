@@ -102,7 +102,7 @@ inline int slot_in(box_t box, int x, int y) { return (y - box.y0) * (box.x1 - bo
 // Step 1.
 kernel void composite_pixels_backward(
     const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
-    const long pixel_stride, const long channel_stride,
+    const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
     global const int* restrict tile_starts,     // [B * tiles + 1]
     global const record_t* restrict records,    // [E]
     global const long* restrict tile_slot_starts,  // [B * tiles]
@@ -137,7 +137,7 @@ kernel void composite_pixels_backward(
   }
   const size_t at = ((size_t)b * height + y) * width + x;
   transmittance[at] = t;
-  global const REAL* g = grad_image + (long)b * height * width * CHANNELS + ((long)y * width + x) * pixel_stride;
+  global const REAL* g = grad_image + b * image_stride + y * row_stride + x * pixel_stride;
   REAL behind = 0;
 #if HAS_GRAD_COVERAGE
   behind -= grad_coverage[at];
@@ -164,7 +164,7 @@ kernel void composite_pixels_backward(
 kernel void sum_slots(
     const int height, const int width, const int tiles_y, const int tiles_x,
     const int x0, const int y0, const int step_x, const int step_y,
-    const long pixel_stride, const long channel_stride,
+    const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
     global const int* restrict tile_starts,     // [B * tiles + 1]
     global const record_t* restrict records,    // [E]
     global const long* restrict tile_slot_starts,  // [B * tiles]
@@ -186,13 +186,13 @@ kernel void sum_slots(
     const box_t box = unpack_box(point.box);
     const bool first = is_first(point.box);
     const size_t slots = tile_slot_starts[index] + slot_starts[e];
-    global const REAL* g = grad_image + (long)b * height * width * CHANNELS + ((long)top * width + left) * pixel_stride;
+    global const REAL* g = grad_image + b * image_stride + top * row_stride + left * pixel_stride;
 #if GRAD_FEATURES
     for (int c = 0; c < CHANNELS; c++) {
       REAL sum = 0;
       for (int y = box.y0; y < box.y1; y++)
         for (int x = box.x0; x < box.x1; x++) {
-          const long pixel = ((long)y * width + x) * pixel_stride;
+          const long pixel = y * row_stride + x * pixel_stride;
           sum += slot_weights[slots + slot_in(box, x, y)] * g[pixel + c * channel_stride];
         }
       const size_t at = (size_t)point.id * CHANNELS + c;
@@ -220,7 +220,7 @@ kernel void sum_slots(
 // Step 3, one work-item a channel of a tile.
 kernel void sum_tile_backgrounds(
     const int height, const int width, const int tiles_y, const int tiles_x,
-    const long pixel_stride, const long channel_stride,
+    const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
     global const REAL* restrict transmittance,       // [B, H, W]
     global const REAL* restrict grad_image,          // [B, C, H, W] by strides
     global REAL* restrict tile_grad_backgrounds)     // [B * tiles, C] out
@@ -228,12 +228,12 @@ kernel void sum_tile_backgrounds(
   const int c = get_global_id(0), index = get_global_id(1);
   const int b = index / (tiles_y * tiles_x);
   const int left = index % tiles_x * TILE, top = index / tiles_x % tiles_y * TILE;
-  global const REAL* g = grad_image + (long)b * height * width * CHANNELS + c * channel_stride;
+  global const REAL* g = grad_image + b * image_stride + c * channel_stride;
   REAL sum = 0;
   for (int y = top; y < min(top + TILE, height); y++) {
     REAL row = 0;
     for (int x = left; x < min(left + TILE, width); x++)
-      row += transmittance[((size_t)b * height + y) * width + x] * g[((long)y * width + x) * pixel_stride];
+      row += transmittance[((size_t)b * height + y) * width + x] * g[y * row_stride + x * pixel_stride];
     sum += row;
   }
   tile_grad_backgrounds[(size_t)index * CHANNELS + c] = sum;

@@ -4,6 +4,9 @@
 #ifdef GRAD_FEATURES
 #define GRAD_GEOMETRY (GRAD_POINTS_UV || GRAD_RADII || GRAD_OPACITIES)
 
+// Numbers from one to the next in dL/dimage, whose memory is in any order; 0 where all are the same number.
+typedef struct { long image, row, pixel, channel; } strides_t;
+
 // Gradients of one point, summed over its fragments in this tile.
 typedef struct { REAL u, v, r, o; } point_grads_t;
 

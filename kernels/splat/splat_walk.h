@@ -37,25 +37,34 @@ inline void write_ahead(
 #endif
 }
 
-// The gradient at a tile's pixels, fetched pixel by pixel while the list is walked forward, which does not need it yet.
-// `next` of `pixels` is next; none where the channels are far apart, for there a cache line holds other pixels too.
-typedef struct { global const REAL* corner; long line; uint pixels, next; } gradient_ahead_t;
+// The gradient at a tile's pixels, fetched item by item while the list is walked forward, which does not need it yet.
+// An item is a pixel where its channels are next to each other, else a row of pixels of PLANES channels.
+#define PLANES ((CHANNELS + TILE - 1) / TILE)
+#define PLANE_GROUPS ((CHANNELS + PLANES - 1) / PLANES)
+typedef struct { global const REAL* corner; strides_t strides; int width; uint items, next; } gradient_ahead_t;
 
-inline gradient_ahead_t gradient_ahead(
-    tile_t tile, int height, int width, long channel_stride, global const REAL* grad_image) {
-  gradient_ahead_t ahead;
-  ahead.line = (long)width * CHANNELS;
-  ahead.corner = grad_image + ((long)tile.b * height + tile.top) * ahead.line + (long)tile.left * CHANNELS;
-  ahead.pixels = channel_stride == 1 ? tile.height * TILE : 0;
-  ahead.next = 0;
+inline gradient_ahead_t gradient_ahead(tile_t tile, strides_t strides, global const REAL* corner) {
+  gradient_ahead_t ahead = {corner, strides, tile.width, 0, 0};
+  if (strides.channel == 1) ahead.items = tile.height * TILE;
+  else if (strides.pixel == 1) ahead.items = tile.height * PLANE_GROUPS;
   return ahead;
 }
 
 inline void fetch_gradient(gradient_ahead_t* ahead) {
-  if (ahead->next == ahead->pixels) return;
-  global const REAL* pixel = ahead->corner + ahead->next / TILE * ahead->line + ahead->next % TILE * CHANNELS;
+  if (ahead->next == ahead->items) return;
+  const strides_t strides = ahead->strides;
+  if (strides.channel == 1) {
+    global const REAL* pixel = ahead->corner + ahead->next / TILE * strides.row + ahead->next % TILE * strides.pixel;
 #pragma unroll
-  for (int c = 0; c < CHANNELS; c += CACHE_LINE / sizeof(REAL)) PREFETCH_FAR(pixel + c);
+    for (int c = 0; c < CHANNELS; c += CACHE_LINE / sizeof(REAL)) PREFETCH_FAR(pixel + c);
+  } else {
+    const int first = ahead->next % PLANE_GROUPS * PLANES;
+    global const REAL* row = ahead->corner + ahead->next / PLANE_GROUPS * strides.row + first * strides.channel;
+    for (int c = 0; c < min(PLANES, CHANNELS - first); c++, row += strides.channel) {
+      PREFETCH_FAR(row);
+      PREFETCH_FAR(row + ahead->width - 1);
+    }
+  }
   ahead->next++;
 }
 

@@ -65,31 +65,51 @@ inline REAL4 quad_alphas(disc_t disc, int x, int y, REAL4 t, REAL min_transmitta
 }
 
 #ifdef GRAD_FEATURES
+// VECTOR numbers of one channel along a row of pixels, of which `count` exist; the others are anything.
+inline vector_t load_line(global const REAL* line, long pixel_stride, int count) {
+  if (pixel_stride == 0) return *line;
+  if (pixel_stride == 1 && count >= VECTOR) return *(global const loose_vector_t*)line;
+  vector_t numbers = 0;
+  for (int x = 0; x < min(count, VECTOR); x++) ((REAL*)&numbers)[x] = line[x * pixel_stride];
+  return numbers;
+}
+
+// Block k of the gradients at VECTOR pixels of a row, of which `count` are in the image, from channels that are not
+// next to each other: a line of pixels for each channel, transposed.
+inline void load_grad_lines(
+    vector_t grads[ROOM][BLOCKS], int k, int count, strides_t strides, global const REAL* pixel) {
+  vector_t lines[VECTOR];
+#pragma unroll
+  for (int lane = 0; lane < VECTOR; lane++) {
+    const bool again = k == BLOCKS - 1 && lane < OVERLAP;
+    lines[lane] = again ? (vector_t)0 : load_line(pixel + (BLOCK_START(k) + lane) * strides.channel, strides.pixel, count);
+  }
+  transpose(lines);
+  if (count >= VECTOR)
+#pragma unroll
+    for (int x = 0; x < VECTOR; x++) grads[x][k] = lines[x];
+  else
+    for (int x = 0; x < count; x++) grads[x][k] = lines[x];
+}
+
 // The gradients at the tile's pixels, 0 outside the image and in the apron. Lanes that overlap are 0, to count once
 // in a dot product.
-inline void load_grad_image(
-    vector_t grads[ROOM][BLOCKS], tile_t tile, int height, int width, long pixel_stride, long channel_stride,
-    global const REAL* grad_image) {
+inline void load_grad_image(vector_t grads[ROOM][BLOCKS], tile_t tile, strides_t strides, global const REAL* corner) {
   for (int y = 0; y < STRIDE; y++)
     for (int x = y < tile.height ? tile.width : 0; x < STRIDE; x++)
 #pragma unroll
       for (int k = 0; k < BLOCKS; k++) grads[y * STRIDE + x][k] = 0;
   for (int y = 0; y < tile.height; y++) {
-    global const REAL* row = grad_image + ((long)tile.b * height * width * CHANNELS) +
-                             ((long)(tile.top + y) * width + tile.left) * pixel_stride;
-    if (channel_stride == 1)
+    global const REAL* row = corner + y * strides.row;
+    if (strides.channel == 1)
       for (int x = 0; x < tile.width; x++) {
-        copy_row(row + x * pixel_stride, grads[y * STRIDE + x]);
+        copy_row(row + x * strides.pixel, grads[y * STRIDE + x]);
         for (int lane = 0; lane < OVERLAP; lane++) ((REAL*)&grads[y * STRIDE + x][BLOCKS - 1])[lane] = 0;
       }
     else
       for (int k = 0; k < BLOCKS; k++)
-        for (int lane = 0; lane < VECTOR; lane++) {
-          const bool again = k == BLOCKS - 1 && lane < OVERLAP;
-          global const REAL* from = row + (BLOCK_START(k) + lane) * channel_stride;
-          for (int x = 0; x < tile.width; x++)
-            ((REAL*)&grads[y * STRIDE + x][k])[lane] = again ? (REAL)0 : from[x * pixel_stride];
-        }
+        for (int x = 0; x < tile.width; x += VECTOR)
+          load_grad_lines(grads + y * STRIDE + x, k, tile.width - x, strides, row + x * strides.pixel);
   }
 }
 #endif

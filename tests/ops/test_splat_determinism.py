@@ -124,22 +124,44 @@ def test_any_strides(mapped_session: opencl.Session, name: str, layout: str) -> 
     assert_same_bits(all_of(as_it_is), all_of(copied))
 
 
-@pytest.mark.parametrize("layout", ["channels-last", "transposed", "expanded"])
-@pytest.mark.parametrize("channels", [1, 5, 16])
+def laid_out(layout: str, shape: torch.Size) -> torch.Tensor:
+    """A random gradient of an output, in a layout of memory."""
+    batch, channels, height, width = shape
+    if layout == "expanded":  # what .sum() makes
+        return torch.tensor(1.5).expand(shape)
+    if layout == "expanded channels":
+        return torch.randn(batch, 1, height, width).expand(shape)
+    if layout == "expanded images":
+        return torch.randn(1, channels, height, width).expand(shape)
+    if layout == "expanded pixels":
+        return torch.randn(batch, channels, 1, 1).expand(shape)
+    if layout == "expanded columns":
+        return torch.randn(batch, channels, height, 1).expand(shape)
+    if layout == "transposed":
+        return torch.randn(batch, channels, width, height).transpose(2, 3)
+    if layout == "slice":
+        return torch.randn(batch + 1, channels + 2, height + 3, width + 5)[1:, 1:-1, 2:-1, 3:-2]
+    if layout == "channels-last slice":
+        return torch.randn(batch, height, width, channels + 2)[..., 1:-1].permute(0, 3, 1, 2)
+    return torch.randn(shape).contiguous(memory_format=torch.channels_last)
+
+
+LAYOUTS = (
+    "channels-last", "channels-last slice", "slice", "transposed", "expanded", "expanded channels", "expanded images",
+    "expanded pixels", "expanded columns",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("channels", [1, 3, 5, 16])
 def test_any_strides_of_the_incoming_gradients(mapped_session: opencl.Session, layout: str, channels: int) -> None:
     arguments = scene(2, 50, channels)
-    image, coverage = splat(**arguments)
-    if layout == "expanded":  # what .sum() makes
-        grads = [torch.tensor(1.5).expand(output.shape) for output in (image, coverage)]
-    elif layout == "transposed":
-        grads = [torch.randn(output.shape).transpose(2, 3).contiguous().transpose(2, 3) for output in (image, coverage)]
-    else:
-        last = torch.channels_last
-        grads = [torch.randn(output.shape).contiguous(memory_format=last) for output in (image, coverage)]
+    outputs = splat(**arguments)
+    grads = [laid_out(layout, output.shape) for output in outputs]
     inputs = [arguments[name] for name in INPUTS]
     planar = [grad.clone(memory_format=torch.contiguous_format) for grad in grads]
-    as_they_are = torch.autograd.grad((image, coverage), inputs, grads, retain_graph=True)
-    assert_same_bits(as_they_are, torch.autograd.grad((image, coverage), inputs, planar))
+    as_they_are = torch.autograd.grad(outputs, inputs, grads, retain_graph=True)
+    assert_same_bits(as_they_are, torch.autograd.grad(outputs, inputs, planar))
 
 
 def test_any_order_in_memory_at_distinct_depths(mapped_session: opencl.Session) -> None:

@@ -125,7 +125,7 @@ def composite_backward(
     Args:
         layer: as in the forward.
         learnt: from the forward.
-        grad_image: [B, C, H, W] in any memory order; planes and channels-last are read in place.
+        grad_image: [B, C, H, W] in any memory order, with any strides >= 0, such as 0 of what is expanded.
         grad_coverage: [B, H, W]; None is zero.
         wanted: the gradients to compute.
     """
@@ -163,7 +163,7 @@ def _launch_tiles_backward(
     grad_coverage: Array | None, outputs: list[opencl.Buffer], per_tile: opencl.Buffer,
 ) -> None:  # fmt: skip
     lists = layer.lists
-    strides, grad_image = _strides(grad_image)
+    strides, grad_image = _strides(lists.session, grad_image)
     # A segment but the last has room for less than one more footprint, which bounds their number.
     segments = 1 + lists.tile_slots // (constants.SEGMENT - _GROUP)
     checkpoint_starts = (np.cumsum(segments) - segments).astype(np.int32)
@@ -186,7 +186,7 @@ def _launch_pixels_backward(
     grad_coverage: Array | None, outputs: list[opencl.Buffer], per_tile: opencl.Buffer,
 ) -> None:  # fmt: skip
     geometry, lists = layer.geometry, layer.lists
-    strides, grad_image = _strides(grad_image)
+    strides, grad_image = _strides(lists.session, grad_image)
     tiles = len(lists.tile_slots)
     starts = job.read(np.cumsum(lists.tile_slots) - lists.tile_slots)
     weights, slot_grads = (job.scratch(int(lists.tile_slots.sum()), layer.dtype) for _ in range(2))
@@ -227,10 +227,12 @@ def _read(job: opencl.Job, array: Array | None) -> opencl.Buffer:
     return job.read(array) if array is not None and array.size else job.scratch(1, np.float64)
 
 
-def _strides(grad_image: Array) -> tuple[list[np.int64], Array]:
-    """Numbers between pixels and between channels, and an array over the same memory that a buffer can hold."""
-    _, channels, height, width = grad_image.shape
-    channels_last = grad_image.transpose(0, 2, 3, 1)
-    if channels_last.flags.c_contiguous:
-        return [np.int64(channels), np.int64(1)], channels_last
-    return [np.int64(1), np.int64(height * width)], np.ascontiguousarray(grad_image)
+def _strides(session: opencl.Session, grad_image: Array) -> tuple[list[np.int64], Array]:
+    """Numbers from one image, row, pixel and channel to the next, and an array over the memory that they span."""
+    strides = [stride // grad_image.itemsize for stride in grad_image.strides]
+    span = 1 + sum((size - 1) * stride for size, stride in zip(grad_image.shape, strides, strict=True))
+    if span > grad_image.size and not session.shares_host_memory:  # what lies between is not worth a transfer
+        return _strides(session, np.ascontiguousarray(grad_image))
+    batch, channels, rows, pixels = map(np.int64, strides)
+    memory = np.lib.stride_tricks.as_strided(grad_image, (span,), (grad_image.itemsize,), writeable=False)
+    return [batch, rows, pixels, np.int64(1) if grad_image.shape[1] == 1 else channels], memory

@@ -257,7 +257,8 @@ class _Composite(torch.autograd.Function):
         features, backgrounds, origin = ctx.saved_tensors
         layer = _layer(ctx.raster, features, backgrounds, ctx.min_transmittance)
         size = (layer.geometry.batch, layer.channels, layer.geometry.height, layer.geometry.width)
-        image = np.zeros(size, layer.dtype) if grad_image is None else grad_image.detach().resolve_neg().numpy()
+        zero = np.broadcast_to(np.zeros((), layer.dtype), size)
+        image = zero if grad_image is None else grad_image.detach().resolve_neg().numpy()
         cover = None if grad_coverage is None else as_array(grad_coverage)
         names = ("points_uv", "radii", "opacities", "features", "backgrounds")
         wanted = Wanted(**dict(zip(names, ctx.needs_input_grad[2:], strict=True)))
