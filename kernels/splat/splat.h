@@ -6,6 +6,12 @@
 #endif
 #define PIXELS (TILE * TILE)
 
+// Drivers may leave OpenCL's own functions as calls: PoCL does where its library was built for another CPU. A call in
+// a loop keeps that loop from becoming vector code, and all vectors are saved around it. These are always inlined.
+inline int smaller_of(int a, int b) { return a < b ? a : b; }
+inline int larger_of(int a, int b) { return a > b ? a : b; }
+typedef REAL2 __attribute__((aligned(REAL_BITS / 8))) pair_t;  // two numbers next to each other
+
 // Slack of the footprint, pixels: u - r is rounded, and the test d2 < r2 decides anyway. It covers float32
 // coordinates up to 2^13 px.
 #define SLACK ((REAL)(1.0 / 512))
@@ -89,7 +95,7 @@ inline bool drawable(REAL u, REAL v, REAL z, REAL r, REAL o) {
 #define MORE_BITS 2
 #define MANY ((1 << MORE_BITS) - 1)
 inline int pack_place(int tile, int more_rows, int more_columns) {
-  return tile << 2 * MORE_BITS | min(more_rows, MANY) << MORE_BITS | min(more_columns, MANY);
+  return tile << 2 * MORE_BITS | smaller_of(more_rows, MANY) << MORE_BITS | smaller_of(more_columns, MANY);
 }
 inline int first_tile(int place) { return place >> 2 * MORE_BITS; }
 inline bool is_in_one_tile(int listed_place) { return (listed_place & ((1 << 2 * MORE_BITS) - 1)) == 0; }

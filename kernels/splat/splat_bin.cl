@@ -53,7 +53,7 @@ kernel void count_tiles(
   for (int t = 0; t < tiles; t++) mine[t] = 0;
   int span = 1;
   for (int strip = chunk.begin; strip < chunk.end; strip += STRIP) {
-    const int end = min(strip + STRIP, chunk.end);
+    const int end = smaller_of(strip + STRIP, chunk.end);
     for (int i = strip; i < end; i++) {
       const REAL u = points_uv[2 * (size_t)i], v = points_uv[2 * (size_t)i + 1];
       const box_t box = footprint(u, v, radii[i], height, width);
@@ -61,7 +61,7 @@ kernel void count_tiles(
                         (list_transparent | (opacities[i] != 0));
       const int x = box.x0 / TILE, y = box.y0 / TILE;
       const int columns = (box.x1 - 1) / TILE - x, rows = (box.y1 - 1) / TILE - y;
-      span = max(span, seen ? max(columns, rows) + 1 : 1);
+      span = larger_of(span, seen ? larger_of(columns, rows) + 1 : 1);
       places[i] = seen ? pack_place(y * tiles_x + x, rows, columns) : -1;
     }
     for (int i = strip; i < end; i++) {
@@ -137,7 +137,7 @@ inline record_t record_of(
   record.o = opacities[id];
   record.id = id;
   const box_t box = footprint(record.u, record.v, record.r, height, width);
-  const box_t inside = {max(box.x0 - left, 0), max(box.y0 - top, 0), min(box.x1 - left, TILE), min(box.y1 - top, TILE)};
+  const box_t inside = {larger_of(box.x0 - left, 0), larger_of(box.y0 - top, 0), smaller_of(box.x1 - left, TILE), smaller_of(box.y1 - top, TILE)};
   record.box = pack_box(inside, is_inside(box, firsts));
   return record;
 }
@@ -177,7 +177,7 @@ inline void sort_list(global entry_t* a, global entry_t* room, int n) {
   for (int i = 1; i < n; i++) differing |= a[i].key ^ a[0].key;
   if (differing == 0) return;
   const int high = REAL_BITS - (int)clz(differing);
-  if (n > FEW) sort_by_two_digits(a, room, n, max(high - 2 * DIGIT_BITS, 0));
+  if (n > FEW) sort_by_two_digits(a, room, n, larger_of(high - 2 * DIGIT_BITS, 0));
   long moves_left = 8 * (long)n + FEW * FEW;
   for (int i = 1; i < n && moves_left > 0; i++) {
     const entry_t entry = a[i];
@@ -256,7 +256,7 @@ kernel void sort_tiles_together(
   global entry_t* b = room + begin;
   for (int run = 1; run < n; run *= 2) {
     for (int i = lane; i < n; i += GROUP) {
-      const int start = i / (2 * run) * (2 * run), middle = min(start + run, n), stop = min(start + 2 * run, n);
+      const int start = i / (2 * run) * (2 * run), middle = smaller_of(start + run, n), stop = smaller_of(start + 2 * run, n);
       const key_bits key = a[i].key;
       const int before = i < middle ? i + rank_in(a + middle, stop - middle, key, false)
                                     : i - run + rank_in(a + start, run, key, true);
@@ -270,7 +270,7 @@ kernel void sort_tiles_together(
   const int tiles = tiles_x * tiles_y;
   const int top = t % tiles / tiles_x * TILE, left = t % tiles_x * TILE;
   const int share = (n + GROUP - 1) / GROUP;
-  const int first = min(lane * share, n), stop = min(first + share, n);
+  const int first = smaller_of(lane * share, n), stop = smaller_of(first + share, n);
   const box_t firsts = first_box(top / TILE, left / TILE, step_y, step_x);
   long slots = 0;
   for (int i = first; i < stop; i++) {

@@ -48,7 +48,7 @@ kernel void composite_tiles(
   int end = tile_starts[index + 1];
   bool finite = true;
   for (int e = begin; e < end; e++) {
-    read_ahead(records, min(e + AHEAD, last), features);  // across the end, into the list of the next tile
+    read_ahead(records, smaller_of(e + AHEAD, last), features);  // across the end, into the list of the next tile
     global const record_t* point = records + e;
     vector_t f[BLOCKS];
     if (!load_row(features + (size_t)point->id * CHANNELS, f)) {
@@ -157,7 +157,7 @@ inline void walk_back(
   int slot = 0;
   for (int e = first; e < stop; e++) slot += quads_in(unpack_box(records[e].box));
   for (int e = stop - 1; e >= first; e--) {
-    const int next = max(e - AHEAD, first);
+    const int next = larger_of(e - AHEAD, first);
     read_ahead(records, next, features);
     write_ahead(records, next, grad_features, grad_points_uv, grad_radii, grad_opacities);
     global const record_t* point = records + e;
@@ -268,7 +268,7 @@ kernel void composite_tiles_backward(
     stop = walk_forward(&walk, first, end, finite, tile, min_transmittance, records, features, &ahead);
   }
 
-  for (int e = max(stop - AHEAD, first); e < stop; e++) read_ahead(records, e, features);
+  for (int e = larger_of(stop - AHEAD, first); e < stop; e++) read_ahead(records, e, features);
   vector_t g[ROOM][BLOCKS];
   load_grad_image(g, tile, strides, corner);
 #if GRAD_BACKGROUNDS

@@ -66,7 +66,7 @@ kernel void composite_pixels(
 {
   local record_t staged[GROUP];
   const int lane = get_local_id(0), index = get_group_id(0), first = get_global_id(1) * CHANNEL_GROUP;
-  const int channels = min(CHANNEL_GROUP, CHANNELS - first);
+  const int channels = smaller_of(CHANNEL_GROUP, CHANNELS - first);
   const int b = index / (tiles_y * tiles_x);
   const int x = index % tiles_x * TILE + lane % TILE, y = index / tiles_x % tiles_y * TILE + lane / TILE;
   REAL sums[CHANNEL_GROUP];
@@ -77,7 +77,7 @@ kernel void composite_pixels(
     barrier(CLK_LOCAL_MEM_FENCE);
     stage(staged, lane, e, end, records, finite);
     barrier(CLK_LOCAL_MEM_FENCE);
-    const int count = min(GROUP, end - e);
+    const int count = smaller_of(GROUP, end - e);
     for (int i = 0; i < count; i++) {
       const REAL dx = x + (REAL)0.5 - staged[i].u, dy = y + (REAL)0.5 - staged[i].v, d2 = dx * dx + dy * dy;
       const REAL r2 = staged[i].r * staged[i].r;
@@ -230,9 +230,9 @@ kernel void sum_tile_backgrounds(
   const int left = index % tiles_x * TILE, top = index / tiles_x % tiles_y * TILE;
   global const REAL* g = grad_image + b * image_stride + c * channel_stride;
   REAL sum = 0;
-  for (int y = top; y < min(top + TILE, height); y++) {
+  for (int y = top; y < smaller_of(top + TILE, height); y++) {
     REAL row = 0;
-    for (int x = left; x < min(left + TILE, width); x++)
+    for (int x = left; x < smaller_of(left + TILE, width); x++)
       row += transmittance[((size_t)b * height + y) * width + x] * g[y * row_stride + x * pixel_stride];
     sum += row;
   }

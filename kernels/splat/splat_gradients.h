@@ -14,8 +14,8 @@ inline void write_scalars(
     point_grads_t grads, int id, bool first, global REAL* grad_points_uv, global REAL* grad_radii,
     global REAL* grad_opacities) {
 #if GRAD_POINTS_UV
-  const REAL2 old_uv = first ? (REAL2)(0) : vload2(id, grad_points_uv);
-  vstore2(old_uv + (REAL2)(grads.u, grads.v), id, grad_points_uv);
+  global pair_t* grad_uv = (global pair_t*)(grad_points_uv + 2 * (size_t)id);
+  *grad_uv = (first ? (REAL2)(0) : *grad_uv) + (REAL2)(grads.u, grads.v);
 #endif
 #if GRAD_RADII
   grad_radii[id] = (first ? (REAL)0 : grad_radii[id]) + grads.r;

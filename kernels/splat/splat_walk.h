@@ -60,7 +60,7 @@ inline void fetch_gradient(gradient_ahead_t* ahead) {
   } else {
     const int first = ahead->next % PLANE_GROUPS * PLANES;
     global const REAL* row = ahead->corner + ahead->next / PLANE_GROUPS * strides.row + first * strides.channel;
-    for (int c = 0; c < min(PLANES, CHANNELS - first); c++, row += strides.channel) {
+    for (int c = 0; c < smaller_of(PLANES, CHANNELS - first); c++, row += strides.channel) {
       PREFETCH_FAR(row);
       PREFETCH_FAR(row + ahead->width - 1);
     }

@@ -21,8 +21,8 @@ inline tile_t tile_at(int t, int height, int width, int tiles_y, int tiles_x) {
   tile.b = t / (tiles_y * tiles_x);
   tile.left = t % tiles_x * TILE;
   tile.top = t / tiles_x % tiles_y * TILE;
-  tile.width = min(TILE, width - tile.left);
-  tile.height = min(TILE, height - tile.top);
+  tile.width = smaller_of(TILE, width - tile.left);
+  tile.height = smaller_of(TILE, height - tile.top);
   return tile;
 }
 
@@ -49,12 +49,12 @@ inline disc_t disc_of(global const record_t* point, tile_t tile) {
 }
 
 inline REAL4 load_quad(const REAL* pixels, int p) {
-  return (REAL4)(vload2(0, pixels + p), vload2(0, pixels + p + STRIDE));
+  return (REAL4)(*(const pair_t*)(pixels + p), *(const pair_t*)(pixels + p + STRIDE));
 }
 
 inline void store_quad(REAL4 quad, REAL* pixels, int p) {
-  vstore2(quad.lo, 0, pixels + p);
-  vstore2(quad.hi, 0, pixels + p + STRIDE);
+  *(pair_t*)(pixels + p) = quad.lo;
+  *(pair_t*)(pixels + p + STRIDE) = quad.hi;
 }
 
 // Alphas of the quad at (x, y), and in *before the transmittances t: both 0 where there is no fragment.
@@ -70,7 +70,7 @@ inline vector_t load_line(global const REAL* line, long pixel_stride, int count)
   if (pixel_stride == 0) return *line;
   if (pixel_stride == 1 && count >= VECTOR) return *(global const loose_vector_t*)line;
   vector_t numbers = 0;
-  for (int x = 0; x < min(count, VECTOR); x++) ((REAL*)&numbers)[x] = line[x * pixel_stride];
+  for (int x = 0; x < smaller_of(count, VECTOR); x++) ((REAL*)&numbers)[x] = line[x * pixel_stride];
   return numbers;
 }
 
