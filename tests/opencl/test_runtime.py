@@ -188,8 +188,23 @@ def test_every_kernel_file_is_found_and_inlined() -> None:
 def test_results_arrive(kernels: Path, fresh: opencl.Session) -> None:
     array = np.arange(1000, dtype=np.float32)
     np.testing.assert_array_equal(scale(fresh, 0.5, array), array / 2)
+    fresh._maps_outputs = True  # as for a CPU device whose driver may keep a copy
+    np.testing.assert_array_equal(scale(fresh, 0.125, array), array / 8)
     fresh.shares_host_memory = False  # copies, as for a GPU
     np.testing.assert_array_equal(scale(fresh, 0.25, array), array / 4)
+
+
+def test_pocl_shows_outputs_without_maps(session: opencl.Session) -> None:
+    if session.info.platform != "Portable Computing Language" or session.info.kind != "CPU":
+        pytest.skip("not PoCL on a CPU")
+    assert not session._maps_outputs
+
+
+def test_scalars_change_from_launch_to_launch(kernels: Path, fresh: opencl.Session) -> None:
+    array = np.ones(3, np.float32)
+    factors = (2.0, -0.5, 1e30, float("inf"), 0.1)
+    assert [scale(fresh, factor, array)[0] for factor in factors] == [np.float32(factor) for factor in factors]
+    assert scale(fresh, 0.1, array.astype(np.float64))[0] == 0.1
 
 
 def test_results_of_one_launch_feed_the_next(kernels: Path, fresh: opencl.Session) -> None:

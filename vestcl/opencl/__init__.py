@@ -45,4 +45,5 @@ _FILES = {
 def __getattr__(name: str) -> Any:
     if name not in _FILES:
         raise AttributeError(f"module 'vestcl.opencl' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"vestcl.opencl.{_FILES[name]}"), name)
+    globals()[name] = value = getattr(importlib.import_module(f"vestcl.opencl.{_FILES[name]}"), name)
+    return value  # which is found without this function from now on

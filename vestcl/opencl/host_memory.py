@@ -1,6 +1,7 @@
 """Memory of the operators' outputs: aligned to cache lines, and recycled where it is large."""
 
 import contextlib
+import math
 import weakref
 from collections.abc import Sequence
 from typing import Any, Final
@@ -20,7 +21,7 @@ class _Block:
 
     def __init__(self, memory: Array, size: int) -> None:
         self._memory = memory
-        start = -memory.ctypes.data % constants.CACHE_LINE
+        start = _to_line(memory)
         self.__array_interface__ = memory[start : start + size].__array_interface__
 
 
@@ -125,12 +126,18 @@ _host_pool = _HostPool()
 def empty(shape: Sequence[int], dtype: np.dtype[Any]) -> Array:
     """An uninitialised array for an operator's output, aligned to cache lines; large ones are recycled."""
     dtype = np.dtype(dtype)
-    size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+    size = math.prod(shape) * dtype.itemsize
     if size >= constants.HOST_POOL_FROM:
         return np.asarray(_host_pool.take(size)).view(dtype).reshape(shape)
     memory = np.empty(size + constants.CACHE_LINE, np.uint8)
-    start = -memory.ctypes.data % constants.CACHE_LINE
+    start = _to_line(memory)
     return memory[start : start + size].view(dtype).reshape(shape)
+
+
+def _to_line(memory: Array) -> int:
+    """Bytes from the start of ``memory`` to its first cache line."""
+    address: int = memory.__array_interface__["data"][0]
+    return -address % constants.CACHE_LINE
 
 
 def free_memory() -> None:
