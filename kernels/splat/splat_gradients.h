@@ -25,15 +25,10 @@ inline void write_scalars(
 #endif
 }
 
-// One work-item a chunk of points: the gradients of points that are in no tile become 0.
-kernel void clear_gradients(
-    const int points,
-    global const int* restrict places,   // [P], see splat_bin.cl
-    global REAL* restrict grad_features, global REAL* restrict grad_points_uv, global REAL* restrict grad_radii,
-    global REAL* restrict grad_opacities)
-{
-  const int c = get_global_id(0), chunks = get_global_size(0);
-  const int begin = (long)points * c / chunks, end = (long)points * (c + 1) / chunks;
+// The gradients of points that are in no tile become 0.
+inline void clear_unlisted(
+    int begin, int end, global const int* restrict places, global REAL* restrict grad_features,
+    global REAL* restrict grad_points_uv, global REAL* restrict grad_radii, global REAL* restrict grad_opacities) {
   const point_grads_t none = {0, 0, 0, 0};
   for (int i = begin; i < end; i++) {
     if (places[i] >= 0) continue;
@@ -44,13 +39,20 @@ kernel void clear_gradients(
   }
 }
 
-// One work-item a channel of an image: its tiles' gradients summed in order, with Kahan's compensation.
-kernel void sum_grad_backgrounds(
-    const int tiles,
-    global const REAL* restrict tile_grad_backgrounds,  // [B, tiles, C]
-    global REAL* restrict grad_backgrounds)             // [B, C] out
+// One work-item a chunk of points.
+kernel void clear_gradients(
+    const int points,
+    global const int* restrict places,   // [P], see splat_bin.cl
+    global REAL* restrict grad_features, global REAL* restrict grad_points_uv, global REAL* restrict grad_radii,
+    global REAL* restrict grad_opacities)
 {
-  const int c = get_global_id(0), b = get_global_id(1);
+  const int c = get_global_id(0), chunks = get_global_size(0);
+  const int begin = (long)points * c / chunks, end = (long)points * (c + 1) / chunks;
+  clear_unlisted(begin, end, places, grad_features, grad_points_uv, grad_radii, grad_opacities);
+}
+
+// The gradient of a channel of an image's background: its tiles' gradients in order, with Kahan's compensation.
+inline REAL sum_over_tiles(int b, int c, int tiles, global const REAL* tile_grad_backgrounds) {
   REAL sum = 0, lost = 0;
   for (int t = 0; t < tiles; t++) {
     const REAL next = tile_grad_backgrounds[((size_t)b * tiles + t) * CHANNELS + c] - lost;
@@ -58,6 +60,16 @@ kernel void sum_grad_backgrounds(
     lost = (larger - sum) - next;
     sum = larger;
   }
-  grad_backgrounds[b * CHANNELS + c] = sum;
+  return sum;
+}
+
+// One work-item a channel of an image.
+kernel void sum_grad_backgrounds(
+    const int tiles,
+    global const REAL* restrict tile_grad_backgrounds,  // [B, tiles, C]
+    global REAL* restrict grad_backgrounds)             // [B, C] out
+{
+  const int c = get_global_id(0), b = get_global_id(1);
+  grad_backgrounds[b * CHANNELS + c] = sum_over_tiles(b, c, tiles, tile_grad_backgrounds);
 }
 #endif

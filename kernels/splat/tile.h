@@ -82,7 +82,8 @@ inline void load_grad_lines(
 #pragma unroll
   for (int lane = 0; lane < VECTOR; lane++) {
     const bool again = k == BLOCKS - 1 && lane < OVERLAP;
-    lines[lane] = again ? (vector_t)0 : load_line(pixel + (BLOCK_START(k) + lane) * strides.channel, strides.pixel, count);
+    global const REAL* line = pixel + (BLOCK_START(k) + lane) * strides.channel;
+    lines[lane] = again ? (vector_t)0 : load_line(line, strides.pixel, count);
   }
   transpose(lines);
   if (count >= VECTOR)

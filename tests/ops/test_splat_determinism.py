@@ -19,6 +19,12 @@ from vestcl.ops import _splat_lists
 from vestcl.ops.splat import composite, rasterize, splat
 
 
+@pytest.fixture(autouse=True)
+def _no_points_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All scenes use the kernels for many points; test_splat_few.py compares them with those for few."""
+    monkeypatch.setattr(_splat_lists, "FEW_POINTS", 0)
+
+
 def bits(channels: int) -> str:
     """A hash of image, coverage and all gradients of a scene with lists of several hundred points."""
     torch.manual_seed(2)

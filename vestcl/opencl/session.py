@@ -143,7 +143,8 @@ class Session:
         self._kernels: dict[tuple[str, tuple[tuple[str, str | int], ...]], dict[str, cl.Kernel]] = {}
         self._typed_kernels: dict[tuple[Any, ...], cl.Kernel] = {}
         """By file, name and defines in the order they came in."""
-        self._maps_outputs = not (info.platform == _POCL and self.shares_host_memory and self._writes_host_memory())
+        #: Results are in the arrays of `Job.write` as soon as a kernel is done; else only after `Job.sync`.
+        self.writes_host_memory = self.shares_host_memory and info.platform == _POCL and self._fills_host_memory()
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self._queue))
         self._lock = RobustLock()
         self._job: Job | None = None
@@ -196,7 +197,7 @@ class Session:
             self._typed_kernels[key] = kernel
         return self._typed_kernels[key]
 
-    def _writes_host_memory(self) -> bool:
+    def _fills_host_memory(self) -> bool:
         """Whether what the device writes to a buffer over an array is in the array as soon as it is done.
 
         OpenCL promises that only after a map, which takes PoCL 20 us and which its local devices do not need.
@@ -416,13 +417,11 @@ class Job(Holder):
         queue = self.session._queue
         maps = []
         for buffer, array in self._outputs:
-            if self.session.shares_host_memory and not self.session._maps_outputs:
-                continue
-            if self.session.shares_host_memory:
+            if not self.session.shares_host_memory:
+                cl.enqueue_copy(queue, array, buffer, is_blocking=False)
+            elif not self.session.writes_host_memory:
                 place = (cl.map_flags.READ, 0, array.shape, array.dtype)
                 maps.append(cl.enqueue_map_buffer(queue, buffer, *place, is_blocking=False)[0])
-            else:
-                cl.enqueue_copy(queue, array, buffer, is_blocking=False)
         queue.finish()
         for mapped in maps:  # not before: rusticl aborts where a map has not come about yet
             mapped.base.release(queue)

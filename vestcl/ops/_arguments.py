@@ -6,6 +6,7 @@ An operator opens with one `check_arguments`, which binds the letters of its sha
     output = np.empty((sizes["B"], sizes["H"] * sizes["W"], 3), as_array(depth).dtype)
 """
 
+import functools
 from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -90,9 +91,14 @@ def _check_shape(name: str, got: list[int], words: list[str], sizes: dict[str, i
 
 def _dtype(value: torch.Tensor | np.ndarray) -> str:
     """The dtype's name; a byte order that is not the machine's is part of it."""
-    if isinstance(value, torch.Tensor):
-        return str(value.dtype).removeprefix("torch.")
-    return value.dtype.name if value.dtype.isnative else value.dtype.str
+    return _name(value.dtype)
+
+
+@functools.cache
+def _name(dtype: torch.dtype | np.dtype[Any]) -> str:
+    if isinstance(dtype, torch.dtype):
+        return str(dtype).removeprefix("torch.")
+    return dtype.name if dtype.isnative else dtype.str
 
 
 def _kind(value: torch.Tensor | np.ndarray) -> str:

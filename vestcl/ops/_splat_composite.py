@@ -1,6 +1,7 @@
 """Launches of compositing, forward and backward, in both mappings: a work-item a tile, or a work-item a pixel."""
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -8,8 +9,12 @@ import numpy as np
 
 from vestcl import constants, opencl
 from vestcl.opencl import host_memory
-from vestcl.ops._splat_lists import Array, Geometry, TileLists, chunks_of
+from vestcl.ops._splat_lists import Array, Geometry, TileLists, are_few, chunks_of
 
+#: Few points in at most so many tiles of all images have their backward in one launch of one work-item ...
+FEW_TILES: Final = 8
+#: ... unless tiles x channels are more than that: work that is worth sharing.
+FEW_NUMBERS: Final = 256
 #: Channels that a GPU's work-item keeps in registers; more are composited in groups.
 CHANNEL_GROUP: Final = 32
 _GROUP: Final = constants.TILE**2
@@ -59,18 +64,11 @@ class Layer:
     def channel_group(self) -> int:
         return min(CHANNEL_GROUP, self.channels)
 
-    def defines(self) -> dict[str, str | int]:
-        own: dict[str, str | int] = {"CHANNELS": self.channels, "TRUNCATE": int(self.min_transmittance > 0)}
+    def defines(self) -> Mapping[str, str | int]:
+        truncates, builtins = self.min_transmittance > 0, self.lists.session.compiles_builtins
         if self.pixels:
-            own["CHANNEL_GROUP"] = self.channel_group
-        else:
-            itemsize, line = self.dtype.itemsize, constants.CACHE_LINE
-            widths = (n for n in (16, 8, 4, 1) if n <= self.channels and n * itemsize <= line)
-            builtins = self.lists.session.compiles_builtins
-            stream = builtins and self.channels * itemsize % line == 0
-            own |= {"VECTOR": next(widths), "SEGMENT": constants.SEGMENT}
-            own |= {"BUILTINS": int(builtins), "STREAM": int(stream)}
-        return opencl.defines_for(self.dtype, **own)
+            return _defines_of_pixels(self.dtype, self.channels, truncates)
+        return _defines_of_tiles(self.dtype, self.channels, truncates, builtins)
 
     def backgrounds_or_zero(self) -> Array:
         zero = (self.geometry.batch, self.channels)
@@ -78,6 +76,21 @@ class Layer:
 
     def scalars(self) -> list[np.generic]:
         return [*self.geometry.sizes, self.dtype.type(self.min_transmittance)]
+
+
+@functools.cache
+def _defines_of_pixels(dtype: np.dtype[Any], channels: int, truncates: bool) -> dict[str, str | int]:
+    own = {"CHANNELS": channels, "TRUNCATE": int(truncates), "CHANNEL_GROUP": min(CHANNEL_GROUP, channels)}
+    return opencl.defines_for(dtype, **own)
+
+
+@functools.cache
+def _defines_of_tiles(dtype: np.dtype[Any], channels: int, truncates: bool, builtins: bool) -> dict[str, str | int]:
+    line = constants.CACHE_LINE
+    own = {"CHANNELS": channels, "TRUNCATE": int(truncates), "SEGMENT": constants.SEGMENT, "BUILTINS": int(builtins)}
+    own["VECTOR"] = next(n for n in (16, 8, 4, 1) if n <= channels and n * dtype.itemsize <= line)
+    own["STREAM"] = int(builtins and channels * dtype.itemsize % line == 0)
+    return opencl.defines_for(dtype, **own)
 
 
 def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
@@ -141,12 +154,16 @@ def composite_backward(
     if geometry.batch == 0:
         return grads
     has = {"HAS_BACKGROUNDS": int(layer.backgrounds is not None), "HAS_GRAD_COVERAGE": int(grad_coverage is not None)}
-    defines = layer.defines() | wanted.defines() | has
+    defines = {**layer.defines(), **wanted.defines(), **has}
     file, launch = (_PIXELS, _launch_pixels_backward) if layer.pixels else (_TILES, _launch_tiles_backward)
     with layer.lists.session.job() as job:
         none = job.scratch(1, layer.dtype)
         *outputs, backgrounds = (job.write(grads[n]) if n in grads and grads[n].size else none for n in shapes)
         per_tile = job.scratch(len(layer.lists.tile_slots) * layer.channels if wanted.backgrounds else 1, layer.dtype)
+        if _is_little(layer):
+            both = [per_tile, backgrounds]
+            _launch_few_backward(job, layer, defines, learnt, grad_image, grad_coverage, outputs, both)
+            return grads
         if geometry.points:
             clear: list[opencl.Argument] = [np.int32(geometry.points), layer.lists.places, *outputs]
             chunks = chunks_of(layer.lists.session, geometry.points, 1)
@@ -158,10 +175,42 @@ def composite_backward(
     return grads
 
 
+def _is_little(layer: Layer) -> bool:
+    tiles = len(layer.lists.tile_slots)
+    little = tiles <= FEW_TILES and tiles * layer.channels <= FEW_NUMBERS
+    return little and are_few(layer.lists.session, layer.geometry)
+
+
 def _launch_tiles_backward(
     job: opencl.Job, layer: Layer, defines: dict[str, str | int], learnt: Array, grad_image: Array,
     grad_coverage: Array | None, outputs: list[opencl.Buffer], per_tile: opencl.Buffer,
 ) -> None:  # fmt: skip
+    scalars, inputs = _tiles_backward_inputs(job, layer, learnt, grad_image, grad_coverage)
+    for phase, count in _phases(layer):
+        job.launch(
+            _TILES, "composite_tiles_backward", defines, count,
+            [*layer.scalars(), *phase, *scalars, *inputs, *outputs, per_tile],
+        )  # fmt: skip
+
+
+def _launch_few_backward(
+    job: opencl.Job, layer: Layer, defines: dict[str, str | int], learnt: Array, grad_image: Array,
+    grad_coverage: Array | None, outputs: list[opencl.Buffer], backgrounds: list[opencl.Buffer],
+) -> None:  # fmt: skip
+    scalars, inputs = _tiles_backward_inputs(job, layer, learnt, grad_image, grad_coverage)
+    inputs.insert(2, layer.lists.places)
+    step_y, step_x = layer.lists.steps
+    sizes = [np.int32(n) for n in (layer.geometry.batch, layer.geometry.points, step_x, step_y)]
+    job.launch(
+        _TILES, "composite_few_backward", defines | {"ONE_ITEM": 1}, (1,),
+        [*layer.scalars(), *sizes, *scalars, *inputs, *outputs, *backgrounds],
+    )  # fmt: skip
+
+
+def _tiles_backward_inputs(
+    job: opencl.Job, layer: Layer, learnt: Array, grad_image: Array, grad_coverage: Array | None
+) -> tuple[list[np.int64], list[opencl.Buffer]]:
+    """The strides of the image's gradient, and what the backward by tiles reads, and scratch memory for checkpoints."""
     lists = layer.lists
     strides, grad_image = _strides(lists.session, grad_image)
     # A segment but the last has room for less than one more footprint, which bounds their number.
@@ -174,11 +223,7 @@ def _launch_tiles_backward(
         job.read(checkpoint_starts),
         job.scratch(checkpoints * (constants.TILE + 1) ** 2, layer.dtype), job.scratch(checkpoints, np.int32),
     ]  # fmt: skip
-    for phase, count in _phases(layer):
-        job.launch(
-            _TILES, "composite_tiles_backward", defines, count,
-            [*layer.scalars(), *phase, *strides, *inputs, *outputs, per_tile],
-        )  # fmt: skip
+    return strides, inputs
 
 
 def _launch_pixels_backward(

@@ -1,5 +1,6 @@
 """Rasterisation: points sorted into depth-ordered tile lists on the device (kernels/splat/splat_bin.cl)."""
 
+import functools
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -13,6 +14,9 @@ Array = np.ndarray[Any, Any]
 GPU_CHUNK: Final = 256
 #: At most so many counters (chunks x tiles) are kept: 64 MiB.
 MAX_COUNTERS: Final = 1 << 24
+#: A CPU lists at most so many points, with at most so many pairs of a point and a tile, in one launch without a wait.
+FEW_POINTS: Final = 1024
+FEW_PAIRS: Final = 1 << 14
 #: Chunks for each compute unit of a CPU, so that an uneven one does not hold up the others.
 CHUNKS_PER_UNIT: Final = 4
 
@@ -40,18 +44,18 @@ class Geometry:
     def batch(self) -> int:
         return len(self.cloud_starts) - 1
 
-    @property
+    @functools.cached_property
     def grid(self) -> tuple[int, int]:
         """Rows and columns of tiles."""
         return -(-self.height // constants.TILE), -(-self.width // constants.TILE)
 
-    @property
+    @functools.cached_property
     def tiles(self) -> int:
         """Tiles of one image."""
         rows, columns = self.grid
         return rows * columns
 
-    @property
+    @functools.cached_property
     def sizes(self) -> list[np.int32]:
         """The first arguments of every kernel."""
         return [np.int32(n) for n in (self.height, self.width, *self.grid)]
@@ -66,14 +70,21 @@ class TileLists:
     """[B * tiles + 1] int32."""
     tile_slots: Array
     """[B * tiles] int64: room that the backward needs, in pixels of all footprints inside the tile."""
-    steps: tuple[int, int]
-    """Rows and columns of tiles from one tile to the next that certainly share no point."""
+    span: Array
+    """[] int32: most tiles that a footprint covers along an axis. Like the arrays above, known when the job is done."""
+    grid: tuple[int, int]
+    """Rows and columns of tiles."""
     records: opencl.Buffer
     """[E] record_t of kernels/splat/splat.h."""
     places: opencl.Buffer
     """[P] int32: the tiles of each point, see pack_place in kernels/splat/splat.h."""
     slot_starts: opencl.Buffer
     """[E] int64: an entry's first slot in its tile; only the mapping "pixel" has it."""
+
+    @property
+    def steps(self) -> tuple[int, int]:
+        """Rows and columns of tiles from one tile to the next that certainly share no point."""
+        return _steps(self.span, self.grid)
 
 
 def chunks_of(session: opencl.Session, points: int, counters: int) -> int:
@@ -86,10 +97,12 @@ def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
     """Count each chunk's points per tile, list them by tile in order of their index, sort each list by depth."""
     defines = _defines(session, geometry)
     tile_counts = np.zeros(geometry.batch * geometry.tiles, np.int32)
+    if are_few(session, geometry):
+        return _list_few(session, geometry, defines)
     with session.job() as job:
         places = job.scratch(geometry.points, np.int32)
         if geometry.points == 0:
-            return _sort(job, geometry, _starts(tile_counts), 1, places, None)
+            return _sort(job, geometry, _starts(tile_counts), np.ones((), np.int32), places, None)
         chunks = chunks_of(session, geometry.points // geometry.batch, geometry.tiles * geometry.batch)
         spans = np.ones((geometry.batch, chunks), np.int32)
         starts, points_uv, z, radii, opacities = (
@@ -113,7 +126,38 @@ def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
             "splat/splat_bin.cl", "fill_tiles", defines, (chunks, geometry.batch),
             [*geometry.sizes, starts, points_uv, z, radii, places, job.read(tile_starts), counts, entries],
         )  # fmt: skip
-        return _sort(job, geometry, tile_starts, int(spans.max()), places, entries)
+        return _sort(job, geometry, tile_starts, spans.max(), places, entries)
+
+
+def are_few(session: opencl.Session, geometry: Geometry) -> bool:
+    pairs = geometry.points * geometry.tiles
+    few = 0 < geometry.points <= FEW_POINTS and max(pairs, geometry.batch * geometry.tiles) <= FEW_PAIRS
+    return few and session.mapping == "tile" and session.shares_host_memory and session.writes_host_memory
+
+
+def _list_few(session: opencl.Session, geometry: Geometry, defines: dict[str, str | int]) -> TileLists:
+    """`list_tiles` by one work-item; the lists are allocated for all points in all tiles."""
+    tiles, pairs = geometry.batch * geometry.tiles, geometry.points * geometry.tiles
+    tile_starts, tile_slots, span = np.empty(tiles + 1, np.int32), np.empty(tiles, np.int64), np.empty((), np.int32)
+    with session.job() as job:
+        arrays = (geometry.cloud_starts, geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
+        places, counts = job.scratch(geometry.points, np.int32), job.scratch(tiles, np.int32)
+        entries, scratch = (job.scratch(pairs, _entry_type(geometry)) for _ in range(2))
+        records = job.scratch(pairs, _record_type(geometry))
+        scalars, transparent = [*geometry.sizes, np.int32(geometry.batch)], np.int32(geometry.list_transparent)
+        job.launch(
+            "splat/splat_bin_few.cl", "list_few", defines, (1,),
+            [*scalars, *(job.read(array) for array in arrays), transparent,
+             places, counts, entries, scratch, records,
+             *(job.write(array) for array in (tile_starts, tile_slots, span))],
+        )  # fmt: skip
+        none = job.scratch(0, np.int64)
+        return TileLists(session, tile_starts, tile_slots, span, geometry.grid, records, places, none)
+
+
+def _steps(span: Array, grid: tuple[int, int]) -> tuple[int, int]:
+    rows, columns = grid
+    return min(int(span), rows), min(int(span), columns)
 
 
 def _defines(session: opencl.Session, geometry: Geometry) -> dict[str, str | int]:
@@ -132,27 +176,30 @@ def _entry_type(geometry: Geometry) -> np.dtype[Any]:
     return np.dtype(f"V{2 * geometry.z.dtype.itemsize}")
 
 
+def _record_type(geometry: Geometry) -> np.dtype[Any]:
+    return np.dtype(f"V{4 * geometry.z.dtype.itemsize + 8}")
+
+
 def _sort(
     job: opencl.Job,
     geometry: Geometry,
     tile_starts: Array,
-    span: int,
+    span: Array,
     places: opencl.Buffer,
     entries: opencl.Buffer | None,
 ) -> TileLists:
     """Sort every tile's entries by (z, index) into records. Without points there is nothing to sort."""
     count, tiles = int(tile_starts[-1]), len(tile_starts) - 1
-    rows, columns = geometry.grid
-    steps = min(span, rows), min(span, columns)
+    steps = _steps(span, geometry.grid)
     together = job.session.mapping == "pixel"
-    records = job.scratch(count, np.dtype(f"V{4 * geometry.z.dtype.itemsize + 8}"))
+    records = job.scratch(count, _record_type(geometry))
     slot_starts = job.scratch(count if together else 0, np.int64)
     tile_slots = np.zeros(tiles, np.int64)
     if entries is not None and count:
         arrays = (tile_starts, geometry.points_uv, geometry.radii, geometry.opacities)
-        room = job.scratch(count, _entry_type(geometry))
+        scratch = job.scratch(count, _entry_type(geometry))
         arguments: list[opencl.Argument] = [*geometry.sizes, *map(np.int32, steps), *map(job.read, arrays)]
-        arguments += [entries, room, records, job.write(tile_slots)]
+        arguments += [entries, scratch, records, job.write(tile_slots)]
         defines = _defines(job.session, geometry)
         if together:
             group = constants.TILE**2
@@ -162,4 +209,4 @@ def _sort(
             )  # fmt: skip
         else:
             job.launch("splat/splat_bin.cl", "sort_tiles", defines, (tiles,), arguments)
-    return TileLists(job.session, tile_starts, tile_slots, steps, records, places, slot_starts)
+    return TileLists(job.session, tile_starts, tile_slots, span, geometry.grid, records, places, slot_starts)
