@@ -20,9 +20,7 @@ from vestcl.bench.pareto.measure import PRICE, Point, front, knee
 from vestcl.bench.pareto.scenes import double, scene, shrunk
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import quality
-from vestcl.models.inference.effort import Effort
-from vestcl.models.inference.quality import Settings
-from vestcl.models.inference.skipping import NOTHING, Skip
+from vestcl.models.inference.options import InferenceOptions
 
 #: Of vest-s, all that can be turned.
 TURNED = dataclasses.replace(
@@ -130,10 +128,11 @@ def test_front_and_knee_by_hand() -> None:
 
 
 def test_settings_are_combined_and_described() -> None:
-    given = Settings(Skip(margin=3), Effort(blocks=2), "bfloat16")
+    given = InferenceOptions(margin=3, blocks=2, autocast="bfloat16")
     assert setting_of(given) == {"skip": {"margin": 3}, "effort": {"blocks": 2}, "autocast": "bfloat16"}
-    assert setting_of(Settings(Skip(), Effort(), None)) == EXACT
-    assert Skip(**setting_of(Settings(NOTHING, Effort(), None))["skip"]) == NOTHING
+    assert setting_of(InferenceOptions()) == EXACT
+    nothing = InferenceOptions().without_skips()
+    assert InferenceOptions.from_dict(setting_of(nothing)) == nothing
     both = combined([{"effort": {"blocks": 2}}, {"skip": {"margin": 0}}, {"effort": {"paint_scale": 0.5}}])
     assert both == {"effort": {"blocks": 2, "paint_scale": 0.5}, "skip": {"margin": 0}}
     assert describe(both) == "margin 0, blocks 2, paint_scale 0.5" and describe(EXACT) == "exact"

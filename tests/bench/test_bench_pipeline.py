@@ -19,7 +19,7 @@ from vestcl.bench.pipeline.measure import ALL, NONE, PEER, SWITCHES, TWICE, Step
 from vestcl.bench.pipeline.traffic import EMPTY, EVERYTHING, JAM, STREETS, TRAFFIC, drive
 from vestcl.models.config import EncoderConfig
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference.skipping import NOTHING, Skip
+from vestcl.models.inference.options import InferenceOptions
 from vestcl.models.inference.stage_times import REST, STAGES
 from vestcl.models.steps import render as _render
 from vestcl.ops.splat import rasterize
@@ -80,27 +80,27 @@ def test_everything_needs_everything(drives: dict[str, _traffic.Drive]) -> None:
     near = torch.nn.functional.max_pool2d(1 - scene.windows[0].frames[0].mask, 8, stride=1)
     assert near.min() == 1
     with torch.no_grad():
-        _, counts = Stepper(model(), variants(Skip(covered=True, still=True))[-1], scene).look()
+        _, counts = Stepper(model(), variants(InferenceOptions(covered=True, still=True))[-1], scene).look()
     assert all(counts[switch].skipped == 0 < counts[switch].of for switch in ("seen", "background", "objects", "views"))
     assert counts["covered"].skipped < 0.8 * counts["covered"].of
 
 
 def test_variants_switch_one_on() -> None:
-    found = {variant.name: variant for variant in variants(Skip(margin=8))}
+    found = {variant.name: variant for variant in variants(InferenceOptions(margin=8))}
     assert list(found) == [NONE, TWICE, *(f"{switch} alone" for switch in SWITCHES), ALL]
     for switch in SWITCHES:
-        skip = found[f"{switch} alone"].skip
+        skip = found[f"{switch} alone"].options
         assert [getattr(skip, other) for other in SWITCHES] == [other == switch for other in SWITCHES]
         assert skip.margin == 8
     assert found["views alone"].base == TWICE and found["seen alone"].base == NONE
-    assert found[NONE].skip == dataclasses.replace(NOTHING, margin=8)
+    assert found[NONE].options == InferenceOptions(margin=8).without_skips()
 
 
 def test_what_is_skipped_is_counted_and_changes_nothing(drives: dict[str, _traffic.Drive]) -> None:
     with torch.no_grad():
         for name in (EMPTY, TRAFFIC):
-            nothing, _ = Stepper(model(), variants(Skip())[0], drives[name]).look()
-            everything, counts = Stepper(model(), variants(Skip())[-1], drives[name]).look()
+            nothing, _ = Stepper(model(), variants(InferenceOptions())[0], drives[name]).look()
+            everything, counts = Stepper(model(), variants(InferenceOptions())[-1], drives[name]).look()
             assert len(nothing) == len(everything) == 1
             assert torch.allclose(nothing[0], everything[0], atol=1e-4)
             assert counts["seen"][:2] == (1, 2)
@@ -110,7 +110,7 @@ def test_what_is_skipped_is_counted_and_changes_nothing(drives: dict[str, _traff
 
 def test_what_the_splatter_leaves_out(drives: dict[str, _traffic.Drive]) -> None:
     with torch.no_grad():
-        counts = Stepper(model(), variants(Skip())[0], drives[EVERYTHING]).splatter()
+        counts = Stepper(model(), variants(InferenceOptions())[0], drives[EVERYTHING]).splatter()
     assert vars(_render)["rasterize"] is rasterize
     points = counts["points without fragments"]
     assert 0 < points.skipped < points.of and 2 * HEIGHT * WIDTH < points.of <= 3 * HEIGHT * WIDTH
@@ -201,9 +201,9 @@ def test_load_takes_quality_and_precision(tmp_path: Path) -> None:
     config = PipelineBench(str(tmp_path / "model.safetensors"), quality="balanced", precision="bfloat16")
     for accelerated in (False, True):
         found = load(dataclasses.replace(config, accelerated=accelerated))
-        assert found.autocast == torch.bfloat16 and found.skip.margin is not None
+        assert found.options.autocast == "bfloat16" and found.options.margin is not None
         assert (type(found) is Forecaster) != accelerated
-    assert load(dataclasses.replace(config, precision="float32")).autocast is None
+    assert load(dataclasses.replace(config, precision="float32")).options.autocast is None
 
 
 @pytest.mark.parametrize(

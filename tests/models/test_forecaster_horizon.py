@@ -1,5 +1,6 @@
 """The forecaster as training uses it: any horizon, gradients from there, what may be left out or be less precise."""
 
+import dataclasses
 from typing import Any
 
 import pytest
@@ -126,7 +127,7 @@ def test_bfloat16_changes_the_image_a_little_and_motion_only_through_features() 
     prior = turning(2, 32, 48)
     with torch.no_grad():
         wanted = model(*pair, K, prior=prior)
-        model.autocast = torch.bfloat16
+        model.options = dataclasses.replace(model.options, autocast="bfloat16")
         got = model(*pair, K, prior=prior)
     assert torch.equal(got.motion.objects.flow, wanted.motion.objects.flow)
     assert torch.equal(got.motion.rigid, wanted.motion.rigid)
@@ -141,8 +142,8 @@ def test_bfloat16_goes_back_to_every_tensor() -> None:
     model, pair, K = stir(Forecaster(SMALL)), pair_of(1, 32, 48), camera(1, 32, 48)
     nn.init.normal_(model.refine.out.weight, std=0.1)
     grads = []
-    for precision in (None, torch.bfloat16):
-        model.autocast = precision
+    for precision in (None, "bfloat16"):
+        model.options = dataclasses.replace(model.options, autocast=precision)
         model.zero_grad()
         view = model(*pair, K, prior=measured(1, 32, 48, cur=(0.1, 0, -0.5))).views[0]
         functional.mse_loss(view.image, pair[1].image).backward()

@@ -15,7 +15,7 @@ from torch import nn
 
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.fast import accelerate
-from vestcl.models.inference.skipping import NOTHING, count_skips
+from vestcl.models.inference.skipping import count_skips
 from vestcl.models.steps.frames import EncodedFrame
 from vestcl.models.steps.memory import EncodedFrames
 from vestcl.scene.layers import LayerBatch
@@ -44,7 +44,7 @@ def run(network: Forecaster, prev: LayerBatch, cur: LayerBatch) -> list[torch.Te
 def fresh(network: Forecaster, prev: LayerBatch, cur: LayerBatch) -> list[torch.Tensor]:
     """The same by a copy that remembers nothing."""
     forgetful = copy.deepcopy(network)
-    forgetful.skip = dataclasses.replace(network.skip, seen=False)
+    forgetful.options = dataclasses.replace(network.options, seen=False)
     return run(forgetful, prev, cur)
 
 
@@ -209,9 +209,9 @@ def test_settings_count() -> None:
     run(network, *pair)
     network.config = dataclasses.replace(network.config, fixed_depth=12.0)
     assert equal(run(network, *pair), fresh(network, *pair))
-    network.autocast = torch.bfloat16
+    network.options = dataclasses.replace(network.options, autocast="bfloat16")
     assert equal(run(network, *pair), fresh(network, *pair))
-    network.autocast = None
+    network.options = dataclasses.replace(network.options, autocast=None)
     with torch.autocast("cpu", torch.bfloat16):
         around = run(network, *pair)
     assert equal(run(network, *pair), fresh(network, *pair)) and not equal(run(network, *pair), around)
@@ -321,7 +321,7 @@ def test_each_thread_has_room_for_two_frames() -> None:
 
 def test_nothing_is_remembered_where_nothing_is_skipped() -> None:
     network, pair = model(), frames()
-    network.skip = NOTHING
+    network.options = network.options.without_skips()
     with count_skips() as tally:
         run(network, *pair)
         run(network, *pair)

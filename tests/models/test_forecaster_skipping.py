@@ -14,7 +14,8 @@ from vestcl.models import configuration
 from vestcl.models.config import EncoderConfig, RenderConfig
 from vestcl.models.forecaster import Forecaster, Step
 from vestcl.models.inference import skipping
-from vestcl.models.inference.skipping import NOTHING, Box, Skip, Tally, boxes, count_skips
+from vestcl.models.inference.options import InferenceOptions
+from vestcl.models.inference.skipping import Box, Tally, boxes, count_skips
 from vestcl.models.networks.encoder import STRIDE, Encoder, reach
 from vestcl.models.networks.object_motion import ObjectMotion
 from vestcl.models.steps.encode import encode
@@ -29,6 +30,7 @@ SPARE = dataclasses.replace(
     object_motion=dataclasses.replace(OBJECTS, where="foreground"),
     render=dataclasses.replace(SMALL.render, stretched=True, inpainted="last", previous="uncovered"),
 )
+NOTHING = InferenceOptions().without_skips()
 HEIGHT, WIDTH = 64, 480
 
 
@@ -37,9 +39,9 @@ def scene(batch: int = 1, *, foreground: bool = True) -> tuple[LayerBatch, Layer
     return pair_of(batch, HEIGHT, WIDTH, foreground)
 
 
-def forecast(model: Forecaster, pair: tuple[LayerBatch, LayerBatch], skip: Skip) -> tuple[Step, Tally]:
+def forecast(model: Forecaster, pair: tuple[LayerBatch, LayerBatch], options: InferenceOptions) -> tuple[Step, Tally]:
     batch = len(pair[0].image)
-    model.skip = skip
+    model.options = options
     K = camera(batch, HEIGHT, WIDTH)
     aside = torch.eye(4).repeat(batch, 1, 1)
     aside[:, 0, 3] = 0.4
@@ -88,7 +90,7 @@ def test_without_foreground_nothing_moves_by_itself() -> None:
     assert network.object_motion is not None
     network.encoder.register_forward_hook(lambda *_: ran.append("encoder"))
     network.object_motion.register_forward_hook(lambda *_: ran.append("objects"))
-    step, tally = forecast(network, scene(foreground=False), Skip())
+    step, tally = forecast(network, scene(foreground=False), InferenceOptions())
     assert torch.equal(step.motion.objects.flow, step.motion.start)
     assert ran == ["encoder", "encoder"]
     for switch in ("background", "objects"):
@@ -105,7 +107,7 @@ def test_what_stands_is_taken_to_stand() -> None:
     for velocity in (prior.velocity_prev, prior.velocity_cur):
         velocity[:, 2, 32:64, 32:80] = 0.8
         velocity[:, 2, 40, 210] = 0.8
-    network.skip = Skip(margin=0, still=True)
+    network.options = InferenceOptions(margin=0, still=True)
     with torch.no_grad(), count_skips() as tally:
         motion = network.forecast(prev, cur, K, 1, [], "compose", prior=prior)[0].motion
     moved = (motion.objects.flow != motion.start).any(dim=1)[0]
@@ -131,10 +133,10 @@ def test_background_features_are_those_of_the_whole_picture() -> None:
     one.mask[..., 20:30, 240:250] = 0
     layers = one._replace(background_image=one.image * one.mask)
     whole = encode(encoder, ENCODER, layers, NOTHING, Tally()).background_grid
-    part = encode(encoder, ENCODER, layers, Skip(), tally := Tally()).background_grid
+    part = encode(encoder, ENCODER, layers, InferenceOptions(), tally := Tally()).background_grid
     assert 0 < tally.counts["background"].skipped < tally.counts["background"].of
     assert torch.allclose(part, whole, atol=1e-5)
-    narrow = encode(encoder, ENCODER, layers, Skip(margin=0), Tally()).background_grid
+    narrow = encode(encoder, ENCODER, layers, InferenceOptions(margin=0), Tally()).background_grid
     assert (narrow - whole).abs().max() > 1e-3
 
 
@@ -211,9 +213,9 @@ def test_every_tensor_still_gets_its_gradient_without_foreground() -> None:
 def test_gradients_are_those_of_everything_computed() -> None:
     pair, K = scene(), camera(1, HEIGHT, WIDTH)
     gradients = []
-    for skip in (NOTHING, Skip()):
+    for options in (NOTHING, InferenceOptions()):
         network = model().double().train()
-        network.skip = skip
+        network.options = options
         one, other = (LayerBatch(*(tensor.double() for tensor in layers)) for layers in pair)
         prior = measured(1, HEIGHT, WIDTH, cur=(0.1, 0, -0.8))
         prior = prior._replace(velocity_prev=prior.velocity_prev.double(), velocity_cur=prior.velocity_cur.double())
@@ -260,16 +262,16 @@ def test_boxes_hold_what_is_wanted_and_do_not_touch() -> None:
 
 def test_a_margin_below_nothing() -> None:
     with pytest.raises(ValueError, match="`margin` must be 0 px or more, or None, got -1"):
-        Skip(margin=-1)
+        InferenceOptions(margin=-1)
 
 
 def test_a_copy_remembers_nothing_of_other_weights(tmp_path: Path) -> None:
     network, pair = model(), scene()
-    before, _ = forecast(network, pair, Skip())
+    before, _ = forecast(network, pair, InferenceOptions())
     nn.init.constant_(network.encoder.out.bias, 0.5)
     network.save(tmp_path / "m.safetensors")
-    loaded, _ = forecast(Forecaster.load(tmp_path / "m.safetensors"), pair, Skip())
-    again, _ = forecast(network, pair, Skip())
+    loaded, _ = forecast(Forecaster.load(tmp_path / "m.safetensors"), pair, InferenceOptions())
+    again, _ = forecast(network, pair, InferenceOptions())
     assert torch.equal(loaded.views[0].image, again.views[0].image)
     assert not torch.equal(before.views[0].image, again.views[0].image)
 

@@ -17,7 +17,6 @@ from vestcl.models import ModelConfig, ObjectMotion
 from vestcl.models.config import ObjectMotionConfig
 from vestcl.models.forecaster import Forecaster, Step
 from vestcl.models.inference import fast
-from vestcl.models.inference.effort import Effort
 from vestcl.models.inference.fast import (
     FastForecaster,
     JointConv,
@@ -26,7 +25,7 @@ from vestcl.models.inference.fast import (
     accelerate,
     share_frames,
 )
-from vestcl.models.inference.skipping import NOTHING
+from vestcl.models.inference.options import InferenceOptions
 from vestcl.models.networks.object_motion import MotionConv
 
 #: Of images with values from 0 to 1, as `accelerate` promises.
@@ -191,12 +190,12 @@ def test_weights_that_are_loaded_later_count() -> None:
 
 def test_the_plain_model_is_untouched() -> None:
     model = trained(TINY)
-    model.skip, model.effort = NOTHING, Effort(min_transmittance=0.01)
+    model.options = InferenceOptions(min_transmittance=0.01).without_skips()
     before = copy.deepcopy(model.state_dict())
     quick = accelerate(model, "bfloat16")
-    assert quick.skip == NOTHING and quick.effort == model.effort and quick.config == model.config
+    assert quick.options == model.options and quick.config == model.config
     quick(*arguments())
-    assert model.autocast is None and all(parameter.requires_grad for parameter in model.parameters())
+    assert model.options.autocast is None and all(parameter.requires_grad for parameter in model.parameters())
     assert not any(isinstance(module, SharedMotionConv) for module in model.modules())
     assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
     assert all(torch.equal(before[name], value) for name, value in quick.state_dict().items())

@@ -13,10 +13,9 @@ from vestcl.bench.pareto.scenes import Scene, scene
 from vestcl.evaluation import metrics
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import quality
-from vestcl.models.inference.effort import Effort
 from vestcl.models.inference.fast import computes_bfloat16
+from vestcl.models.inference.options import InferenceOptions
 from vestcl.models.inference.quality import LEVELS, LOSS, Quality
-from vestcl.models.inference.skipping import Skip
 
 FIGURES = Path(__file__).parents[2] / "docs" / "time_against_error" / "pareto.json"
 
@@ -68,28 +67,28 @@ def test_the_committed_figures_keep_the_bound() -> None:
 
 def test_exact_is_as_a_network_is_loaded() -> None:
     model, fresh = quality.apply(Forecaster(SMALL), "fast"), Forecaster(SMALL)
-    assert (model.skip, model.effort) != (fresh.skip, fresh.effort)
-    assert quality.settings("exact") == (Skip(), Effort(), None)
+    assert model.options != fresh.options
+    assert quality.settings("exact") == InferenceOptions()
     quality.apply(model, "exact")
-    assert (model.skip, model.effort, model.autocast) == (fresh.skip, fresh.effort, fresh.autocast)
+    assert model.options == fresh.options
 
 
 def test_bfloat16_where_the_processor_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert quality.settings("balanced").autocast == "bfloat16"
-    wanted = torch.bfloat16 if computes_bfloat16() else None
-    assert quality.apply(Forecaster(SMALL), "balanced").autocast == wanted
+    wanted = "bfloat16" if computes_bfloat16() else None
+    assert quality.apply(Forecaster(SMALL), "balanced").options.autocast == wanted
     monkeypatch.setattr(quality, "computes_bfloat16", lambda: False)
-    assert quality.apply(Forecaster(SMALL), "balanced").autocast is None
+    assert quality.apply(Forecaster(SMALL), "balanced").options.autocast is None
 
 
 @pytest.mark.parametrize("config", [TINY, PAINTING])
 def test_networks_that_paint_anew_paint_at_full_size(config: type) -> None:
-    assert quality.apply(Forecaster(config), "fast").effort.paint_scale == 1
+    assert quality.apply(Forecaster(config), "fast").options.paint_scale == 1
 
 
 def test_what_files_tell() -> None:
     told = quality.about("balanced")
-    assert told["quality"] == "balanced" and told["skip"]["margin"] == quality.settings("balanced").skip.margin
+    assert told["quality"] == "balanced" and told["skip"]["margin"] == quality.settings("balanced").margin
     assert set(told) == {"quality", "skip", "effort", "autocast"} and "min_transmittance" in told["effort"]
 
 

@@ -93,9 +93,9 @@ def test_a_model_is_that_of_its_seed_or_its_file(cache: Path, tmp_path: Path) ->
     first.save(tmp_path / "first.safetensors")
     given = build_model(configured(cache, tmp_path, seed=2, init=str(tmp_path / "first.safetensors")))
     assert all(torch.equal(one, two) for one, two in zip(first.parameters(), given.parameters(), strict=True))
-    assert given.training and given.autocast is None
+    assert given.training and given.options.autocast is None
     halved = configured(cache, tmp_path, run={"precision": "bfloat16"})
-    assert build_model(halved).autocast == torch.bfloat16
+    assert build_model(halved).options.autocast == "bfloat16"
     with pytest.raises(ValueError, match=r"`init` must hold weights of small-painting, got .*first\.safetensors"):
         build_model(configured(cache, tmp_path, model="small-painting", init=str(tmp_path / "first.safetensors")))
     with pytest.raises(FileNotFoundError, match=r"absent\.safetensors"):

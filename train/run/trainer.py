@@ -2,7 +2,7 @@
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, cast
 
 import torch
@@ -18,8 +18,6 @@ from vestcl import opencl
 from vestcl.models.config import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster, RenderedView, Step
 from vestcl.models.networks.encoder import load_resnet34
-
-_PRECISIONS: Final = {"float32": None, "bfloat16": torch.bfloat16}
 
 
 class NotANumberError(RuntimeError):
@@ -60,7 +58,8 @@ def build_model(config: Config) -> Forecaster:
             load_resnet34(model.encoder, config.init_encoder)
         except ValueError as error:
             raise ValueError(f"`init_encoder` must hold ResNet34's weights for {config.model} ({error})") from error
-    model.autocast = _PRECISIONS[config.run.precision]
+    precision = config.run.precision
+    model.options = replace(model.options, autocast=None if precision == "float32" else precision)
     return model.train()
 
 

@@ -80,7 +80,7 @@ class Forecast:
     profile: dict[str, float] = field(default_factory=dict)
     """A network's seconds by stage; they are in ``seconds``, too, as one number."""
     skipped: dict[str, SkippedWork] = field(default_factory=dict)
-    """By switch of `vestcl.models.inference.skipping.Skip`."""
+    """By switch of `vestcl.models.inference.options.InferenceOptions`."""
     notes: tuple[str, ...] = ()
     """Lines for the user: what was left out, and why."""
     mode: str | None = None

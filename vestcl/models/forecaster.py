@@ -214,7 +214,7 @@ class Forecaster(
         """`show` in each camera, and in one that comes twice once."""
         views: list[RenderedView] = []
         for camera in cameras:
-            known = known_view(cameras[: len(views)], views, camera) if self.skip.views else None
+            known = known_view(cameras[: len(views)], views, camera) if self.options.views else None
             current_tally().add("views", known is not None, 1, "views")
             views.append(known or self.show(clouds, camera, motion, K))
         return views

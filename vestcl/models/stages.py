@@ -9,8 +9,9 @@ from torch import nn
 
 from vestcl import geometry
 from vestcl.models.config import OPAQUE, ModelConfig
-from vestcl.models.inference.effort import Effort, enlarged, fraction, reduced
-from vestcl.models.inference.skipping import Skip, current_tally
+from vestcl.models.inference.options import EXACT
+from vestcl.models.inference.resolution import enlarged, fraction, reduced
+from vestcl.models.inference.skipping import current_tally
 from vestcl.models.inference.stage_times import timed
 from vestcl.models.networks.ego_motion import CameraMotion, EgoMotion, RigidMotion
 from vestcl.models.networks.encoder import Encoder
@@ -53,14 +54,9 @@ class Stages(nn.Module):
         self.ego_motion = None if config.ego_motion is None else EgoMotion(config.ego_motion, features, config.start)
         self.object_motion = None if config.object_motion is None else ObjectMotion(config.object_motion, features)
         self.refine = Refine(config.refine, config.render, features)
-        #: Encoder and refinement compute in this type (torch.bfloat16, or None for the parameters' own): motion, which
-        #: is millimetres in hundreds of metres, never does.
-        self.autocast: torch.dtype | None = None
-        #: What is not computed where a scene does not need it; `vestcl.models.inference.skipping.count_skips` counts
-        #: it.
-        self.skip = Skip()
-        #: What is computed more coarsely than the network was trained to.
-        self.effort = Effort()
+        #: What is skipped and what is computed more coarsely; `vestcl.models.inference.skipping.count_skips` counts
+        #: the former.
+        self.options = EXACT
         #: The frames that were encoded last.
         self.memory = EncodedFrames()
 
@@ -88,7 +84,7 @@ class Stages(nn.Module):
             if known is not None:
                 return known._replace(layers=layers)
         with self._autocast():
-            encoded = encode(self.encoder, self.config.encoder, layers, self.skip, tally)
+            encoded = encode(self.encoder, self.config.encoder, layers, self.options, tally)
         if self.ego_motion is not None:
             depth, mask = grid_depth(layers.background_depth), grid_mean(layers.mask)
             encoded = encoded._replace(camera_grid=self.ego_motion.look(encoded.background_grid, depth, mask))
@@ -172,9 +168,7 @@ class Stages(nn.Module):
         """OMF at full size, [B, 6, H, W] m in and out; ``start`` is what it corrects."""
         if self.object_motion is None or self.object_motion.changes_nothing:
             return unmoved(start)
-        return move_objects(
-            self.object_motion, prev, cur, to_next, flow0, start, self.skip, current_tally(), self.effort.blocks
-        )
+        return move_objects(self.object_motion, prev, cur, to_next, flow0, start, self.options, current_tally())
 
     @timed
     def lift(self, prev: EncodedFrame, cur: EncodedFrame, motion: Motion, K: torch.Tensor) -> list[Cloud]:
@@ -227,7 +221,7 @@ class Stages(nn.Module):
     def splat(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> list[Side]:
         """What each cloud leaves on the view, of the frames' size; arguments as in `show`."""
         height, width = motion.flow0.shape[2:]
-        size = fraction(height, width, self.effort.splat_scale)
+        size = fraction(height, width, self.options.splat_scale)
         if size != (height, width):
             camera = camera._replace(K=geometry.scale_intrinsics(camera.K, size[1] / width, size[0] / height))
         sides = self._splat(clouds, camera, motion, K, size)
@@ -237,16 +231,16 @@ class Stages(nn.Module):
     def paint(self, sides: Sequence[Side]) -> torch.Tensor:
         """The refined image [B, 3, H, W], from the channels that `RenderConfig.channels` counts.
 
-        What refinement adds to its base is computed at `Effort.paint_scale`, from means over the sides' cells. A
-        refinement of geometric forecasts leaves the base as it is.
+        What refinement adds to its base is computed at `InferenceOptions.paint_scale`, from means over the sides'
+        cells. A refinement of geometric forecasts leaves the base as it is.
         """
         render = self.config.render
         if self.refine.of_forecast:
             return self.refine.base_of([looks_of(side, render.normalised) for side in sides])
         height, width = sides[0].coverage.shape[2:]
-        size = fraction(height, width, self.effort.paint_scale)
+        size = fraction(height, width, self.options.paint_scale)
         if size != (height, width) and self.refine.base == "none":
-            raise ValueError(f"`effort.paint_scale` must be 1 for {self.config.name}, which paints anew, got {size}")
+            raise ValueError(f"`options.paint_scale` must be 1 for {self.config.name}, which paints anew, got {size}")
         seen = [Side(*(reduced(plane, *size) for plane in side)) for side in sides]
         rendered = side_by_side([refined_channels(side, render.colour, render.normalised) for side in seen])
         with self._autocast():
@@ -259,38 +253,41 @@ class Stages(nn.Module):
 
     @timed
     def retouch(self, planes: torch.Tensor) -> torch.Tensor:
-        """What refinement adds to the image of a geometric forecast, [B, 3, H, W]; at `Effort.paint_scale` as `paint`.
+        """What refinement adds to the image of a geometric forecast, [B, 3, H, W].
+
+        As `paint`, at `InferenceOptions.paint_scale`.
 
         Args:
             planes: [B, FORECAST_PLANES, H, W], of `vestcl.forecasting.network.planes`.
         """
         height, width = planes.shape[2:]
         with self._autocast():
-            painted = self.refine.painted(reduced(planes, *fraction(height, width, self.effort.paint_scale)))
+            painted = self.refine.painted(reduced(planes, *fraction(height, width, self.options.paint_scale)))
         return self.refine.change(planes, enlarged(painted.to(planes.dtype), height, width))
 
     def _splat(
         self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor, size: tuple[int, int]
     ) -> list[Side]:
-        known = camera, K, motion.rigid.detach(), self.config.render, *size, self.effort.min_transmittance
+        known = camera, K, motion.rigid.detach(), self.config.render, *size, self.options.min_transmittance
         if self.config.render.previous == "all" or len(clouds) == 1:
             return [splat_cloud(cloud, *known, flat=self.flat) for cloud in clouds]
         prev, cur = clouds
         front = splat_cloud(cur, *known, flat=self.flat)
         uncovered = front.coverage.detach() < OPAQUE
         deep = inner_holes(uncovered) if self.config.render.inpainted == "inner" else None
-        tally = current_tally() if self.skip.covered else None
+        tally = current_tally() if self.options.covered else None
         behind = splat_cloud(prev, *known, uncovered, tally, deep, self.flat)
         return [Side(*(plane * uncovered for plane in behind)), front]
 
     def _state(self) -> State | None:
         """What features depend on besides the frame; None where they are not remembered."""
-        if torch.is_grad_enabled() or not self.skip.seen:
+        if torch.is_grad_enabled() or not self.options.seen:
             return None
         networks = [network for network in (self.encoder, self.ego_motion) if network is not None]
         weights = [weight for network in networks for weight in (*network.parameters(), *network.buffers())]
         around = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else None
-        return self.memory.state((self.config, self.skip, self.autocast, around), weights)
+        return self.memory.state((self.config, self.options.of_encoder, around), weights)
 
     def _autocast(self) -> torch.autocast:
-        return torch.autocast("cpu", self.autocast, enabled=self.autocast is not None)
+        name = self.options.autocast
+        return torch.autocast("cpu", None if name is None else getattr(torch, name), enabled=name is not None)

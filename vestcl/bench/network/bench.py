@@ -89,7 +89,7 @@ def main(config: NetworkBench) -> None:
         machine = _results.describe(session)
         _results.show_machine(machine, console)
         model = made(model_config, config.seed)
-        model.skip = dataclasses.replace(model.skip, seen=False)  # the frames are the same ones in all runs
+        model.options = dataclasses.replace(model.options, seen=False)  # the frames are the same ones in all runs
         frames, K = street_frames(config.height, config.width, config.seed)
         parts = list(_parts(config, console, model, frames, torch.from_numpy(K)[None].float()))
     if config.json is not None:

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference.effort import Effort
-from vestcl.models.inference.quality import Settings
-from vestcl.models.inference.skipping import NOTHING
+from vestcl.models.inference.options import InferenceOptions
 
 Setting = dict[str, Any]
 """How a forecast is computed, as far as it differs from the defaults: {"skip": {...}, "effort": {...}, "autocast":
@@ -18,12 +16,12 @@ Setting = dict[str, Any]
 EXACT: Final[Setting] = {}
 
 
-def setting_of(settings: Settings) -> Setting:
-    """What ``settings`` change."""
-    changed: Setting = {"autocast": settings.autocast} if settings.autocast else {}
+def setting_of(options: InferenceOptions) -> Setting:
+    """What ``options`` change."""
+    own, default = options.as_dict(), InferenceOptions().as_dict()
+    changed: Setting = {"autocast": options.autocast} if options.autocast else {}
     for name in ("skip", "effort"):
-        own = getattr(settings, name)
-        if parts := {key: value for key, value in vars(own).items() if value != getattr(type(own)(), key)}:
+        if parts := {key: value for key, value in own[name].items() if value != default[name][key]}:
             changed[name] = parts
     return changed
 
@@ -50,7 +48,7 @@ def _text(value: Any) -> str:
 def knobs(model: Forecaster) -> list[Knob]:
     """The knobs that the configuration of ``model`` has, with the values to try."""
     transmittances, scales = (0.0, 0.001, 0.01, 0.03, 0.1, 0.3), (1.0, 0.75, 0.5)
-    off = setting_of(Settings(NOTHING, Effort(), None))
+    off = setting_of(InferenceOptions().without_skips())
     sizes = {_text(scale): {"size": scale} if scale < 1 else EXACT for scale in scales}
     skipping = {"on": EXACT, "frames seen are encoded anew": {"skip": {"seen": False}}, "off": off}
     found = [

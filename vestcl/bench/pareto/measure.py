@@ -17,8 +17,8 @@ from vestcl.bench.pareto.scenes import Scene, double, shrunk
 from vestcl.evaluation import metrics
 from vestcl.forecasting.network.input import NetworkInput
 from vestcl.models.forecaster import Forecaster, Mode
-from vestcl.models.inference.effort import Effort, enlarged
-from vestcl.models.inference.skipping import NOTHING, Skip
+from vestcl.models.inference.options import InferenceOptions
+from vestcl.models.inference.resolution import enlarged
 from vestcl.models.steps.memory import EncodedFrames
 
 Images = list[torch.Tensor]
@@ -64,7 +64,7 @@ class Bench:
 
     def __post_init__(self) -> None:
         exact = copy.deepcopy(self.model).double()
-        exact.skip = NOTHING
+        exact.options = exact.options.without_skips()
         self.references = [step(exact, double(scene.given)).clamp(0, 1) for scene in self.scenes]
 
 
@@ -79,8 +79,7 @@ def step(model: Forecaster, given: NetworkInput, steps: int = 1, mode: Mode | No
 
 def apply(model: Forecaster, setting: Setting) -> None:
     """Set the switches of ``setting``; its size is that of the input."""
-    model.skip, model.effort = Skip(**setting.get("skip", {})), Effort(**setting.get("effort", {}))
-    model.autocast = torch.bfloat16 if "autocast" in setting else None
+    model.options = InferenceOptions.from_dict(setting)
 
 
 def measure(bench: Bench, settings: Mapping[str, Setting]) -> list[Point]:

@@ -10,7 +10,7 @@ from vestcl import geometry
 from vestcl.data import Street, street_clip
 from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.network.input import NetworkInput, last_motions, network_input
-from vestcl.models.inference.effort import fraction, reduced
+from vestcl.models.inference.resolution import fraction, reduced
 from vestcl.models.networks.layers import mapped
 from vestcl.prepare.frame import prepare_frame
 from vestcl.scene.layers import LayerBatch

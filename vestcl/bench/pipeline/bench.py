@@ -1,11 +1,10 @@
 """`vestcl bench pipeline`: a complete forecast step in empty streets and full ones, and what skipping saves of it."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, Literal
 
-import torch
 from rich.console import Console
 
 from vestcl import opencl
@@ -82,10 +81,11 @@ def load(config: PipelineBench) -> Forecaster:
     """
     model = quality.apply(Forecaster.from_pretrained(config.model), config.quality)
     if config.precision is not None:
-        model.autocast = torch.bfloat16 if config.precision == "bfloat16" else None
+        precision = None if config.precision == "float32" else config.precision
+        model.options = replace(model.options, autocast=precision)
     if not config.accelerated:
         return model
-    return accelerate(model, "float32" if model.autocast is None else "bfloat16")
+    return accelerate(model, "bfloat16" if model.options.autocast else "float32")
 
 
 def _check(config: PipelineBench) -> None:
@@ -112,7 +112,7 @@ def _sections(config: PipelineBench, model: Forecaster, _: opencl.Session, conso
         scene["name"]: {key: count._asdict() for key, count in (scene["counts"] | scene["splatter"]).items()}
         for scene in scenes
     }
-    about = {"skip": model.skip, "effort": model.effort, "autocast": model.autocast and str(model.autocast)}
+    about = model.options.as_dict()
     about |= {"scenes": {scene["name"]: scene for scene in scenes}, "counts": counts}
     yield Section("", [], details=about | {"peak_gigabytes": peak_gigabytes()})
 

@@ -17,7 +17,8 @@ from vestcl.bench.pipeline.splatter import counting
 from vestcl.bench.pipeline.traffic import Drive, Window
 from vestcl.evaluation import metrics
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference.skipping import NOTHING, Count, Skip, count_skips
+from vestcl.models.inference.options import InferenceOptions
+from vestcl.models.inference.skipping import Count, count_skips
 from vestcl.models.inference.stage_times import watching, with_rest
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.opencl import trace
@@ -33,7 +34,7 @@ NONE, ALL = "nothing skipped", "all skipped"
 #: Nothing skipped, where a camera is asked for twice: what "views" is compared with.
 TWICE: Final = "nothing skipped, the view twice"
 
-#: Of `Skip`, in the order of a forecast.
+#: Of `InferenceOptions`, in the order of a forecast.
 SWITCHES: Final = ("seen", "background", "objects", "covered", "views")
 
 
@@ -42,7 +43,7 @@ class Variant:
     """A way to make the same forecast."""
 
     name: str
-    skip: Skip
+    options: InferenceOptions
     base: str | None = None
     """The variant that it is compared with."""
     switch: str | None = None
@@ -54,14 +55,14 @@ class Variant:
         return TWICE in (self.name, self.base)
 
 
-def variants(skip: Skip) -> list[Variant]:
-    """Nothing skipped, each switch by itself, and all that ``skip`` has on."""
-    nothing = dataclasses.replace(NOTHING, margin=skip.margin, still=skip.still)
+def variants(options: InferenceOptions) -> list[Variant]:
+    """Nothing skipped, each switch by itself, and all that ``options`` has on."""
+    nothing = options.without_skips()
     found = [Variant(NONE, nothing), Variant(TWICE, nothing)]
     for switch in SWITCHES:
-        one, base = dataclasses.replace(nothing, **{switch: True}), TWICE if switch == "views" else NONE
-        found.append(Variant(f"{switch} alone", one, base, switch))
-    return [*found, Variant(ALL, skip, NONE)]
+        one = dataclasses.replace(nothing, **{switch: True})  # type: ignore[arg-type]
+        found.append(Variant(f"{switch} alone", one, TWICE if switch == "views" else NONE, switch))
+    return [*found, Variant(ALL, options, NONE)]
 
 
 class Stepper:
@@ -70,7 +71,7 @@ class Stepper:
     def __init__(self, model: Forecaster, variant: Variant, drive: Drive) -> None:
         self.variant, self._drive = variant, drive
         self._model = copy.deepcopy(model)  # each variant remembers its own frames
-        self._model.skip = variant.skip
+        self._model.options = variant.options
         self._windows = itertools.cycle(enumerate(drive.windows))
         self.stages: list[dict[str, float]] = []
         self.places: list[int] = []
@@ -102,7 +103,7 @@ class Stepper:
 
     def splatter(self) -> dict[str, Count]:
         """What the splatter left out of the drive's last step."""
-        with counting(self._model.effort.min_transmittance) as found:
+        with counting(self._model.options.min_transmittance) as found:
             self._forecast(self._drive.windows[-1])
         points, tiles, pixels = (sum(getattr(one, name) for one in found) for name in ("points", "tiles", "pixels"))
         return {
@@ -129,7 +130,7 @@ def measure_scene(model: Forecaster, drive: Drive, seconds: float, threads: int,
         skipped, which has no switch; "of_peer" and "of_copy", the step with all skipped as multiples of theirs;
         "pictures", what skipping changes.
     """
-    steppers = {variant.name: Stepper(model, variant, drive) for variant in variants(model.skip)}
+    steppers = {variant.name: Stepper(model, variant, drive) for variant in variants(model.options)}
     tasks: dict[str, Task] = {name: stepper.step for name, stepper in steppers.items()}
     planes = torch.cat([plane for frame in drive.windows[0].frames for plane in frame], dim=1)
     tasks |= {COPY: _timing.copies_of_forward(planes, threads)["torch copy_"], INPAINT: _inpaint(drive)}

@@ -40,7 +40,7 @@ LEAST_FRAMES: Final = 4
 #: Of a jam, m/s: walking pace.
 _JAM_SPEED: Final = 1.5
 
-#: Metres an interval along each axis that all of it moves: more than what `Skip.still` takes to stand.
+#: Metres an interval along each axis that all of it moves: more than what `InferenceOptions.still` takes to stand.
 _MOVED: Final = 0.1
 
 #: The scene "everything": m to the wall and to what is scattered before it ...

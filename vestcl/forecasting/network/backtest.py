@@ -146,7 +146,7 @@ def _present(model: Forecaster) -> list[str]:
     """The parts that change something."""
     camera, objects = model.ego_motion, model.object_motion
     still = camera is None or (camera.bounded is not None and camera.bounded.changes_nothing)
-    unmoved = objects is None or objects.changes_nothing or model.effort.blocks == 0
+    unmoved = objects is None or objects.changes_nothing or model.options.blocks == 0
     return [*([] if still else [CAMERA]), *([] if unmoved else [OBJECTS]), REFINEMENT]
 
 

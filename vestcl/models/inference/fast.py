@@ -10,6 +10,7 @@ import ctypes
 import inspect
 import platform
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Final, Literal, get_args
 
 import torch
@@ -41,7 +42,7 @@ def accelerate(model: Forecaster, precision: Precision = "float32") -> "FastFore
     """A copy of ``model`` that forecasts the same, faster, and records no gradients; ``model`` stays as it is.
 
     Args:
-        model: a trained one; its configuration, weights, skips and effort are copied.
+        model: a trained one; its configuration, weights and options are copied.
         precision: "float32" gives the same images up to rounding: within 1e-4 of values from 0 to 1, but for pixels
             where that decides which of two points is the nearer one. "bfloat16" lets encoder and refinement compute in
             it: PSNR against the others is 40 dB and more. It pays on processors that have it, see `computes_bfloat16`.
@@ -88,17 +89,16 @@ class FastForecaster(Forecaster):
     """A `Forecaster` for inference; `accelerate` makes it.
 
     Args:
-        model: whose configuration, weights, skips and effort it copies.
+        model: whose configuration, weights and options it copies.
         precision: that encoder and refinement compute in.
     """
 
     def __init__(self, model: Forecaster, precision: Precision) -> None:
         super().__init__(model.config)
         self.load_state_dict(unwrapped(model.state_dict(), model.config.name))
-        self.skip, self.effort = model.skip, model.effort
-        self.autocast = torch.bfloat16 if precision == "bfloat16" else None
+        self.options = replace(model.options, autocast=None if precision == "float32" else precision)
         if self.object_motion is not None:
-            share_frames(self.object_motion, self.effort.blocks)
+            share_frames(self.object_motion, self.options.blocks)
         self.eval()
         for parameter in self.parameters():
             parameter.requires_grad_(False)
@@ -162,7 +162,7 @@ def share_frames(network: ObjectMotion, blocks: int | None = None) -> bool:
 
     Args:
         network: object motion of shape "dmvfn" without routing. Its weights may change at any time.
-        blocks: the first so many share, as more are not going to run (see `Effort.blocks`); None is all.
+        blocks: the first so many share, as more are not going to run (see `InferenceOptions.blocks`); None is all.
 
     Returns:
         Whether they do. Others stay as they are: blocks that routing leaves out would be computed after all, and at the

@@ -8,16 +8,13 @@
 `vestcl bench pareto` measures the curve; docs/time_against_error has it, and the points chosen.
 """
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, get_args
-
-import torch
+from typing import Any, Final, Literal, get_args
 
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference.effort import Effort
 from vestcl.models.inference.fast import FastForecaster, accelerate, computes_bfloat16, keep_freed_memory
-from vestcl.models.inference.skipping import Skip
+from vestcl.models.inference.options import BALANCED, EXACT, FAST, InferenceOptions
 
 Quality = Literal["exact", "balanced", "fast"]
 
@@ -31,41 +28,24 @@ USUAL: Final[Quality] = "balanced"
 LOSS: Final[dict[Quality, float]] = {"exact": 0.0, "balanced": 0.1, "fast": 0.5}
 
 
-class Settings(NamedTuple):
-    """What a level sets of a `Forecaster`."""
-
-    skip: Skip
-    effort: Effort
-    autocast: str | None
-    """The name of torch's type that encoder and refinement compute in; None is the parameters' own."""
+_PRESETS: Final[dict[Quality, InferenceOptions]] = {"exact": EXACT, "balanced": BALANCED, "fast": FAST}
 
 
-_SETTINGS: Final[dict[Quality, Settings]] = {
-    "exact": Settings(Skip(), Effort(), None),
-    "balanced": Settings(
-        Skip(margin=16, still=True), Effort(min_transmittance=0.01, blocks=2, paint_scale=0.5), "bfloat16"
-    ),
-    "fast": Settings(
-        Skip(margin=16, still=True), Effort(min_transmittance=0.03, blocks=0, paint_scale=0.25), "bfloat16"
-    ),
-}
-
-
-def settings(quality: Quality) -> Settings:
-    """What ``quality`` sets.
+def settings(quality: Quality) -> InferenceOptions:
+    """The preset of that name.
 
     Args:
         quality: one of `LEVELS`.
 
     Returns:
-        Switches, effort and precision, as `Forecaster` has them.
+        Options, as `Forecaster` has them.
 
     Raises:
         ValueError: another word.
     """
     if quality not in LEVELS:
         raise ValueError(f"`quality` must be one of {', '.join(LEVELS)}, got {quality!r}")
-    return _SETTINGS[quality]
+    return _PRESETS[quality]
 
 
 def about(quality: Quality) -> dict[str, Any]:
@@ -74,8 +54,7 @@ def about(quality: Quality) -> dict[str, Any]:
     Raises:
         ValueError: another word.
     """
-    skip, effort, autocast = settings(quality)
-    return {"quality": quality, "skip": asdict(skip), "effort": asdict(effort), "autocast": autocast}
+    return {"quality": quality, **settings(quality).as_dict()}
 
 
 def apply(model: Forecaster, quality: Quality) -> Forecaster:
@@ -94,11 +73,10 @@ def apply(model: Forecaster, quality: Quality) -> Forecaster:
     Raises:
         ValueError: another word.
     """
-    skip, effort, autocast = settings(quality)
+    options = settings(quality)
     if model.config.refine.base == "none":
-        effort = replace(effort, paint_scale=1.0)
-    model.skip, model.effort = skip, effort
-    model.autocast = getattr(torch, autocast) if autocast and computes_bfloat16() else None
+        options = replace(options, paint_scale=1.0)
+    model.options = options if computes_bfloat16() else replace(options, autocast=None)
     return model
 
 
@@ -115,4 +93,4 @@ def load(name_or_path: str | Path, quality: Quality) -> FastForecaster:
     """
     keep_freed_memory()
     model = apply(Forecaster.from_pretrained(name_or_path), quality)
-    return accelerate(model, "float32" if model.autocast is None else "bfloat16")
+    return accelerate(model, "bfloat16" if model.options.autocast else "float32")

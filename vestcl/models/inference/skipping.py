@@ -1,4 +1,4 @@
-"""What a scene does not need, and so is not computed: the switches, and what they saved."""
+"""Conditional computation: the regions that a scene needs, and counts of what was skipped."""
 
 import contextlib
 from collections.abc import Iterator
@@ -15,40 +15,6 @@ _PASS: Final = 16384
 
 #: From this share of a picture on boxes are not worth while.
 _WHOLE: Final = 0.6
-
-
-@dataclass(frozen=True)
-class Skip:
-    """Switches. With ``margin`` None and ``still`` off each of them changes nothing but rounding."""
-
-    seen: bool = True
-    """A frame of the same content as one of the last two is not encoded again while weights and settings stay the
-    same. (Where gradients are recorded, it is.)"""
-    background: bool = True
-    """The background is encoded around what foreground hides, and not at all where there is none."""
-    objects: bool = True
-    """Object motion is forecast around the foreground, and not at all where there is none."""
-    covered: bool = True
-    """Of the previous frame's points those are splatted that come to where the current frame leaves something open."""
-    views: bool = True
-    """A camera that is asked for twice is shown once."""
-    margin: int | None = None
-    """Pixels around the foreground that both are computed with; None is as far as the networks' convolutions reach."""
-    still: bool = False
-    """With ``objects``, things that were measured to stand are taken to stand: object motion is forecast around what
-    moves."""
-
-    def __post_init__(self) -> None:
-        if self.margin is not None and self.margin < 0:
-            raise ValueError(f"`margin` must be 0 px or more, or None, got {self.margin}")
-
-    def around(self, reach: int) -> int:
-        """``margin`` in pixels, of a network that reaches so far."""
-        return reach if self.margin is None else self.margin
-
-
-#: Everything is computed.
-NOTHING: Final = Skip(seen=False, background=False, objects=False, covered=False, views=False)
 
 
 class Count(NamedTuple):

@@ -4,27 +4,30 @@ import torch
 from torch.nn import functional
 
 from vestcl.models.config import EncoderConfig
-from vestcl.models.inference.skipping import Box, Skip, Tally, boxes
+from vestcl.models.inference.options import InferenceOptions
+from vestcl.models.inference.skipping import Box, Tally, boxes
 from vestcl.models.networks.encoder import COARSEST, STRIDE, Encoder, reach, upsample_features
 from vestcl.models.networks.group_norm import NotedStatistics
 from vestcl.models.steps.frames import FOREGROUND_BELOW, EncodedFrame
 from vestcl.scene.layers import LayerBatch
 
 
-def encode(encoder: Encoder, config: EncoderConfig, layers: LayerBatch, skip: Skip, tally: Tally) -> EncodedFrame:
+def encode(
+    encoder: Encoder, config: EncoderConfig, layers: LayerBatch, options: InferenceOptions, tally: Tally
+) -> EncodedFrame:
     """Features of frames and of their backgrounds.
 
     Args:
         encoder: the network.
         config: of it; says what a background is normalised by.
         layers: of B frames.
-        skip: with ``background`` the background is encoded where it has to be.
+        options: with ``background`` the background is encoded where it has to be.
         tally: is told how much that left out.
     """
     if config.background == "own":
         own, background = _apart(encoder, layers, tally)
     else:
-        own, background = _borrowing(encoder, config, layers, skip, tally)
+        own, background = _borrowing(encoder, config, layers, options, tally)
     own, background = own.to(layers.image.dtype), background.to(layers.image.dtype)
     return EncodedFrame(layers, upsample_features(own, *layers.image.shape[2:]), background, own is background)
 
@@ -44,20 +47,20 @@ def _apart(encoder: Encoder, layers: LayerBatch, tally: Tally) -> tuple[torch.Te
 
 
 def _borrowing(
-    encoder: Encoder, config: EncoderConfig, layers: LayerBatch, skip: Skip, tally: Tally
+    encoder: Encoder, config: EncoderConfig, layers: LayerBatch, options: InferenceOptions, tally: Tally
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Backgrounds by their frames' statistics, and their frames' features in cells where they are the frame."""
     statistics = NotedStatistics()
     own = encoder(layers.image, statistics.note)
     differs = (layers.background_image != layers.image).any(dim=1, keepdim=True)
     rows, total = differs.flatten(1).any(dim=1).nonzero()[:, 0], _pixels(layers, len(own))
-    if skip.background and not len(rows):
+    if options.background and not len(rows):
         tally.add("background", total, total, "px")
         return own, own
     height, width = differs.shape[2:]
     parts = [Box(0, height, 0, width)]
-    if skip.background:
-        parts = boxes(differs.any(dim=0)[0], skip.around(reach(config)), COARSEST)
+    if options.background:
+        parts = boxes(differs.any(dim=0)[0], options.around(reach(config)), COARSEST)
     else:
         rows = torch.arange(len(own))
     cells = functional.max_pool2d(differs[rows].to(own.dtype), STRIDE, ceil_mode=True) > 0

@@ -8,7 +8,8 @@ import torch
 from torch.nn import functional
 
 from vestcl.models.config import LOG_DEPTH_FAR
-from vestcl.models.inference.skipping import Box, Skip, Tally, boxes
+from vestcl.models.inference.options import InferenceOptions
+from vestcl.models.inference.skipping import Box, Tally, boxes
 from vestcl.models.networks.ego_motion import CameraMotion
 from vestcl.models.networks.object_motion import ObjectMotion, ObjectMotionForecast
 from vestcl.models.steps.frames import FOREGROUND_BELOW, EncodedFrame
@@ -35,9 +36,8 @@ def move_objects(
     to_next: CameraMotion,
     flow0: torch.Tensor,
     start: torch.Tensor,
-    skip: Skip,
+    options: InferenceOptions,
     tally: Tally,
-    blocks: int | None = None,
 ) -> ObjectMotionForecast:
     """OMF at full size, [B, 6, H, W] m in and out.
 
@@ -51,17 +51,16 @@ def move_objects(
         to_next: the camera's motion from both.
         flow0: the rigid flow.
         start: what OMF corrects.
-        skip: with ``objects``, OMF runs around the foreground, if it is to move nothing else; with ``still`` around
-            what moves of it.
+        options: with ``objects``, OMF runs around the foreground, if it is to move nothing else; with ``still`` around
+            dynamic objects only; ``blocks`` is how many blocks run, None is all.
         tally: is told how much that left out.
-        blocks: only the first so many run; None is all.
     """
-    if blocks == 0:
+    if options.blocks == 0:
         return unmoved(start)
     moving = torch.cat([frame.layers.mask < FOREGROUND_BELOW for frame in (prev, cur)], dim=1)
-    if skip.objects and skip.still and start is not flow0 and moving.any():
+    if options.objects and options.still and start is not flow0 and moving.any():
         moving &= _rolling(moving, start - flow0)
-    found = _where(network, moving, skip, tally, blocks)
+    found = _where(network, moving, options, tally)
     if not found:
         return unmoved(start)
     seen = [prev.features, cur.features]
@@ -81,7 +80,9 @@ def move_objects(
         moves = box.cut(moving) if network.config.where == "foreground" else None
         pieces.append(_Piece(box, beyond, box.cut(start), moves))
         behind = list(map(box.cut, backgrounds))
-        forecasts.append(network(*map(box.cut, seen), box.cut(start) - beyond, blocks=blocks, backgrounds=behind))
+        forecasts.append(
+            network(*map(box.cut, seen), box.cut(start) - beyond, blocks=options.blocks, backgrounds=behind)
+        )
 
     def whole(parts: Iterable[torch.Tensor]) -> torch.Tensor:
         flow = start.clone()
@@ -127,13 +128,13 @@ def _rolling(foreground: torch.Tensor, beside: torch.Tensor) -> torch.Tensor:
     return functional.interpolate(rolling.to(metres), scale_factor=_CELL)[..., :height, :width] > 0
 
 
-def _where(network: ObjectMotion, moving: torch.Tensor, skip: Skip, tally: Tally, blocks: int | None) -> list[Box]:
+def _where(network: ObjectMotion, moving: torch.Tensor, options: InferenceOptions, tally: Tally) -> list[Box]:
     """The parts of the picture that OMF is to see; one alone where it chooses its blocks by the whole scene."""
     batch, _, height, width = moving.shape
     whole = Box(0, height, 0, width)
-    if network.config.where == "everywhere" or not skip.objects:
+    if network.config.where == "everywhere" or not options.objects:
         return [whole]
-    found = boxes(moving.flatten(0, 1).any(dim=0), skip.around(network.reach_of(blocks)), network.multiple)
+    found = boxes(moving.flatten(0, 1).any(dim=0), options.around(network.reach_of(options.blocks)), network.multiple)
     if network.routing is not None and found:
         found = [functools.reduce(Box.around, found)]
     if not found and network.learns:

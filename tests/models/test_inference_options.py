@@ -9,7 +9,8 @@ from forecaster_scenes import PAINTING, SMALL, camera, measured, pair_of, stir
 
 from vestcl.models import ObjectMotion
 from vestcl.models.forecaster import Forecaster, Step
-from vestcl.models.inference.effort import Effort, enlarged, fraction, reduced
+from vestcl.models.inference.options import InferenceOptions
+from vestcl.models.inference.resolution import enlarged, fraction, reduced
 from vestcl.scene.layers import LayerBatch
 
 HEIGHT, WIDTH = 48, 64
@@ -25,8 +26,8 @@ def scene() -> tuple[LayerBatch, LayerBatch]:
     return pair_of(1, HEIGHT, WIDTH)
 
 
-def forecast(model: Forecaster, effort: Effort, pair: tuple[LayerBatch, LayerBatch], learns: bool = False) -> Step:
-    model.effort = effort
+def forecast(model: Forecaster, pair: tuple[LayerBatch, LayerBatch], learns: bool = False, **options: Any) -> Step:
+    model.options = InferenceOptions(**options)
     prior = measured(1, HEIGHT, WIDTH, cur=(0.1, 0, -0.8), velocity=(0.3, 0, 0.2))
     with torch.set_grad_enabled(learns):
         return model(*pair, camera(1, HEIGHT, WIDTH), prior=prior)
@@ -48,7 +49,10 @@ def smooth(pair: tuple[LayerBatch, LayerBatch]) -> tuple[LayerBatch, LayerBatch]
 @pytest.mark.parametrize("knob", [{"splat_scale": 0.5}, {"splat_scale": 0.7}, {"paint_scale": 0.5}, {"blocks": 1}])
 def test_views_keep_their_size_and_a_flat_wall_its_colour(knob: dict[str, Any]) -> None:
     model, pair = network(), smooth(scene())
-    exact, coarse = forecast(model, Effort(), pair).views[0], forecast(model, Effort(**knob), pair).views[0]
+    exact, coarse = (
+        forecast(model, pair).views[0],
+        forecast(model, pair, **knob).views[0],
+    )
     assert all(one.shape == other.shape for one, other in zip(exact, coarse, strict=True))
     inside = (slice(None), slice(None), slice(8, -8), slice(8, -8))  # what comes in at the border is guessed
     assert (coarse.image[inside] - exact.image[inside]).abs().max() < 0.05
@@ -61,25 +65,28 @@ def test_views_keep_their_size_and_a_flat_wall_its_colour(knob: dict[str, Any]) 
 def test_each_knob_changes_something(knob: dict[str, Any]) -> None:
     model, pair = network(), scene()
     torch.nn.init.normal_(model.refine.out.weight, std=0.1)
-    exact, coarse = forecast(model, Effort(), pair).views[0].image, forecast(model, Effort(**knob), pair).views[0].image
+    exact, coarse = (
+        forecast(model, pair).views[0].image,
+        forecast(model, pair, **knob).views[0].image,
+    )
     assert not torch.equal(exact, coarse)
-    assert torch.equal(exact, forecast(model, Effort(), pair).views[0].image)
+    assert torch.equal(exact, forecast(model, pair).views[0].image)
 
 
 def test_transmittance_keeps_its_bound() -> None:
     model, pair = network(), scene()
-    exact, coarse = (forecast(model, Effort(min_transmittance=t), pair).views[0] for t in (0.0, 0.1))
+    exact, coarse = (forecast(model, pair, min_transmittance=t).views[0] for t in (0.0, 0.1))
     for name, largest in (("colour", 1.0), ("coverage", 1.0)):  # of values in [0, 1], over two sides
         assert (getattr(exact, name) - getattr(coarse, name)).abs().max() <= 2 * 0.1 * largest
 
 
 def test_no_block_is_no_object_motion() -> None:
     model, pair = network(), scene()
-    motion = forecast(model, Effort(blocks=0), pair).motion
+    motion = forecast(model, pair, blocks=0).motion
     assert torch.equal(motion.objects.flow, motion.start) and motion.objects.ran.shape == (1, 0)
-    first, every = (forecast(model, Effort(blocks=count), pair, True).motion.objects for count in (1, 2))
+    first, every = (forecast(model, pair, True, blocks=count).motion.objects for count in (1, 2))
     assert first.ran.tolist() == [[True, False]] and every.ran.tolist() == [[True, True]]
-    assert torch.allclose(every.flow, forecast(model, Effort(), pair).motion.objects.flow)
+    assert torch.allclose(every.flow, forecast(model, pair).motion.objects.flow)
     assert torch.allclose(first.flow, every.candidates[0], atol=1e-5) and not torch.allclose(first.flow, every.flow)
 
 
@@ -91,8 +98,8 @@ def test_fewer_blocks_reach_less() -> None:
 
 def test_a_network_that_paints_anew_has_nothing_to_enlarge() -> None:
     model = stir(Forecaster(dataclasses.replace(PAINTING))).eval()
-    with pytest.raises(ValueError, match=r"`effort\.paint_scale` must be 1 for tiny, which paints anew"):
-        forecast(model, Effort(paint_scale=0.5), scene())
+    with pytest.raises(ValueError, match=r"`options\.paint_scale` must be 1 for tiny, which paints anew"):
+        forecast(model, scene(), paint_scale=0.5)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +115,7 @@ def test_a_network_that_paints_anew_has_nothing_to_enlarge() -> None:
 )
 def test_refuses(knob: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Effort(**knob)
+        InferenceOptions(**knob)
 
 
 def test_sizes_by_hand() -> None:
