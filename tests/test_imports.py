@@ -16,7 +16,7 @@ SOURCES = [*LIBRARY, *sorted((ROOT / "train").rglob("*.py"))]
 
 #: The rooms of vestcl; each may import those of its own line and of the lines above it.
 ORDER = (
-    ("_version", "constants", "shapes", "geometry", "times", "interrupt"),
+    ("_version", "constants", "shapes", "geometry", "clock", "times", "interrupt"),
     ("opencl", "io"),
     ("ops", "reference", "data"),
     ("scene",),

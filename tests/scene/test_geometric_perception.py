@@ -277,7 +277,8 @@ def test_seconds_are_exclusive(monkeypatch: pytest.MonkeyPatch) -> None:
 
     clip = drive(4).clip
     samples = (replace(s, image=slow(s, "image", 1), depth=slow(s, "depth", 10)) for s in clip)
-    monkeypatch.setattr("vestcl.scene.perception.time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    told = SimpleNamespace(perf_counter=lambda: clock[0], perf_counter_ns=lambda: 0)
+    monkeypatch.setattr("vestcl.clock.time", told)
     perception = Perception(replace(clip, samples=tuple(samples)))
     perception.seen(FRAME)
     taken = {stage: seconds for stage, seconds in perception.seconds.items() if seconds}

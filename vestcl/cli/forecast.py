@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from vestcl import opencl
 from vestcl.cli import checks, commands
 from vestcl.cli.clip import load_estimators, open_clip
 from vestcl.cli.progress import ProgressBar
+from vestcl.clock import Clock
 from vestcl.data.sample import Clip
 from vestcl.evaluation import compare
 from vestcl.evaluation.compare import Comparison
@@ -51,10 +51,10 @@ DEFAULT_LEARNED: Final = "tested"
 
 @dataclass
 class _Stages:
-    """The bar on the terminal, and how long each stage took."""
+    """The bar on the terminal, and the clock of what is done outside of the forecast."""
 
     bar: ProgressBar
-    seconds: dict[str, float] = field(default_factory=dict)
+    clock: Clock = field(default_factory=Clock)
 
     def __post_init__(self) -> None:
         self.task = self.bar.add_task("", total=1.0)
@@ -63,9 +63,8 @@ class _Stages:
     def stage(self, name: str) -> Iterator[Callable[[float], None]]:
         """Times the block; yields what it may tell its share done to."""
         self.show(name, 0.0)
-        start = time.perf_counter()
-        yield lambda share: self.show(name, share)
-        self.seconds[name] = time.perf_counter() - start
+        with self.clock.stage(name):
+            yield lambda share: self.show(name, share)
 
     def show(self, name: str, share: float) -> None:
         """Draw the bar anew."""
@@ -100,7 +99,7 @@ def run(options: commands.Forecast) -> None:
             trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
             st_lpips = None if options.st_lpips is None else StLpips.load(options.st_lpips)
         forecast = _forecast(clip, index, options, views, stages, inpaint, model, later)
-        stages.seconds |= forecast.seconds
+        stages.clock.seconds |= forecast.seconds
         comparisons, rival = list[Comparison](), None
         if options.compare:
             with stages.stage("compare") as report:
@@ -111,7 +110,7 @@ def run(options: commands.Forecast) -> None:
                     comparisons = [_beside(*pair, rival.method) for pair in zip(comparisons, rivals, strict=True)]
         with stages.stage(forecast_files.WRITING) as report:
             details = _details(options, clip, index, forecast, comparisons, later)
-            told = dataclasses.replace(forecast, seconds=dict(stages.seconds))
+            told = dataclasses.replace(forecast, seconds=dict(stages.clock.seconds))
             write = functools.partial(forecast_files.write_forecast, exr=options.exr, gif=options.gif, report=report)
             write(options.out, told, clip, index, views, details)
     for comparison in comparisons:

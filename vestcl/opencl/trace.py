@@ -6,9 +6,9 @@ A recording sees every thread and every device of the process::
         with trace.stage("forecast"), trace.stage("splat"):
             vestcl.splat(...)
 
-While nothing records, a `stage` costs a function call. Format: Chrome's Trace Event Format, a track for each Python
-thread and each device. A device's times come from its OpenCL events: t_host = t_device - d, with d from `Session`'s
-clock bounds; no kernel is then before the call that enqueued it, or after the wait for its job.
+A `stage` is a span of `vestcl.clock`, as all timed stages are. Format: Chrome's Trace Event Format, a track for
+each Python thread and each device. A device's times come from its OpenCL events: t_host = t_device - d, with d from
+`Session`'s clock bounds; no kernel is then before the call that enqueued it, or after the wait for its job.
 """
 
 import contextlib
@@ -24,7 +24,11 @@ from typing import Any, Final
 
 from vestcl import opencl
 from vestcl._version import __version__
+from vestcl.clock import record_spans
+from vestcl.clock import span as stage
 from vestcl.io import atomic
+
+__all__ = ["record", "stage"]
 
 #: Nanoseconds after which a device's clock is compared with the host's again: clocks drift by tens of ppm, which is
 #: some ten microseconds then.
@@ -108,28 +112,27 @@ class _Record(opencl.observe):
 
     def __enter__(self) -> None:
         global _record
-        if _current() is not None:
+        if _record is not None and not _record.abandoned:
             raise ValueError(f"`path` must be the only trace that is recorded, got {self._path} while another one is")
         super().__enter__()
         _record = self
+        record_spans(self._stage)
+
+    def _stage(self, name: str, start: int, end: int) -> None:
+        """Keep a span; not one of the time before, nor one after an interrupt ended the ``with`` block."""
+        if not self.abandoned and start >= self.recording.began:
+            self.recording.span(name, "stage", start, end)
 
     def _leave(self, *_: object) -> None:
         global _record
         _record = None
+        record_spans(None)
         super()._leave()
         atomic.write_bytes(self._path, (json.dumps(_content(self.recording)) + "\n").encode())
 
 
 #: What records. One for the process, because stages of all threads belong to it.
 _record: _Record | None = None
-
-_NOTHING: Final = contextlib.nullcontext()
-
-
-def _current() -> _Recording | None:
-    """Where stages belong now; not the recording of a ``with`` block that an interrupt ended."""
-    record = _record
-    return None if record is None or record.abandoned else record.recording
 
 
 def record(path: str | Path | None) -> AbstractContextManager[None]:
@@ -143,26 +146,7 @@ def record(path: str | Path | None) -> AbstractContextManager[None]:
 
     Source: Chrome's "Trace Event Format", as Perfetto reads it.
     """
-    return _NOTHING if path is None else _Record(path)
-
-
-def stage(name: str) -> AbstractContextManager[None]:
-    """A named span of the calling thread, for a ``with`` block; inside another one it is drawn below it.
-
-    Args:
-        name: as shown. A stage that goes on when the recording ends is not in it.
-    """
-    recording = _current()
-    return _NOTHING if recording is None else _stage(name, recording)
-
-
-@contextlib.contextmanager
-def _stage(name: str, recording: _Recording) -> Iterator[None]:
-    start = time.perf_counter_ns()
-    try:
-        yield
-    finally:
-        recording.span(name, "stage", start, time.perf_counter_ns())
+    return contextlib.nullcontext() if path is None else _Record(path)
 
 
 # ---------------------------------------------------------------- the file

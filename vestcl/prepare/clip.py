@@ -6,8 +6,6 @@ import fcntl
 import functools
 import hashlib
 import shutil
-import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.clock import Clock
 from vestcl.data.sample import Clip, Sample
 from vestcl.io.atomic import read_bytes
 from vestcl.io.images import to_float, to_pixels
@@ -116,12 +115,12 @@ def _complete(
     clip: Clip, perception: Perception, folder: Path, estimators: str, report: Report
 ) -> tuple[Outcome, list[str]]:
     """Write what is missing; returns what was done, and the frames' keys."""
-    start = time.perf_counter()
-    if perception.clip is not clip:  # the right images are in no frame's key otherwise
-        estimators += f"|targets {_digest_of(clip).hex()}"
-    keys = frame_keys(perception.clip, estimators)
-    missing = {index for index, key in enumerate(keys) if not _is_there(clip, folder, index, key)}
-    seconds = Counter({"check": time.perf_counter() - start})
+    clock = Clock()
+    with clock.stage("check"):
+        if perception.clip is not clip:  # the right images are in no frame's key otherwise
+            estimators += f"|targets {_digest_of(clip).hex()}"
+        keys = frame_keys(perception.clip, estimators)
+        missing = {index for index, key in enumerate(keys) if not _is_there(clip, folder, index, key)}
     if missing or not (folder / JSON).is_file():
         _remove(folder / JSON)  # a clip of old and new frames is no clip
     for path in (frame_path(folder, index) for index in missing):
@@ -130,20 +129,18 @@ def _complete(
     _tidy(folder, len(clip))
     for index, key in enumerate(keys):
         if index in missing:
-            seconds.update(_write(clip, perception, folder, index, key))
+            _write(clip, perception, folder, index, key, clock)
         report(index in missing)
-    return Outcome(len(missing), len(clip) - len(missing), {**perception.seconds, **seconds}), keys
+    return Outcome(len(missing), len(clip) - len(missing), {**perception.seconds, **clock.seconds}), keys
 
 
-def _write(clip: Clip, perception: Perception, folder: Path, index: int, key: str) -> dict[str, float]:
-    """Compute and write a frame; returns the seconds that this took beside perception."""
+def _write(clip: Clip, perception: Perception, folder: Path, index: int, key: str, clock: Clock) -> None:
+    """Compute and write a frame; ``clock`` has what perception's has not."""
     frame, camera = prepare_frame(perception, index), clip[index].right
-    start = time.perf_counter()
-    right = None if camera is None else camera.read_image()
-    middle = time.perf_counter()
-    with _explained(frame_path(folder, index)):
+    with clock.stage("right"):
+        right = None if camera is None else camera.read_image()
+    with clock.stage("write"), _explained(frame_path(folder, index)):
         write_frame(folder, index, key, frame, right)
-    return {"right": middle - start, "write": time.perf_counter() - middle}
 
 
 def _is_there(clip: Clip, folder: Path, index: int, key: str) -> bool:

@@ -3,7 +3,6 @@
 import logging
 import math
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
@@ -11,6 +10,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.clock import Clock
 from vestcl.data.calibration import power
 from vestcl.data.sample import Clip
 from vestcl.io.labels import SKY, background
@@ -125,11 +125,11 @@ class Perception:
         self.clip = clip
         self.inpaint = inpainter(DEFAULT if inpaint is None else inpaint)
         self.has_labels = all(sample.labels is not None for sample in clip)
-        self.seconds: dict[str, float] = {}
+        self._clock = Clock()
+        self.seconds = self._clock.seconds
         self._progress = progress
         self._kept: dict[tuple[str, int], Any] = {}
         self._lifetimes: dict[tuple[str, int], int] = {}
-        self._inner = 0.0
         self._lock = threading.RLock()
         self._empty: set[int] = set()
 
@@ -260,7 +260,8 @@ class Perception:
             if key not in self._kept:
                 if self._progress:
                     self._progress(stage)
-                self._kept[key] = self._timed(stage, compute)
+                with self._clock.stage(stage):
+                    self._kept[key] = compute()
                 self._lifetimes[key] = max(lifetime, _KEPT)
                 self._forget(index)
             return self._kept[key]
@@ -270,7 +271,8 @@ class Perception:
         key = (name, index)
         with self._lock:
             if key not in self._kept:
-                self._kept[key] = self._timed(stage, compute)
+                with self._clock.stage(stage):
+                    self._kept[key] = compute()
                 self._forget(index)
             return self._kept[key]
 
@@ -281,16 +283,6 @@ class Perception:
             if not index - lifetime < key[1] <= index + lifetime:
                 del self._kept[key]
                 self._lifetimes.pop(key, None)
-
-    def _timed(self, stage: str, compute: Callable[[], Result]) -> Result:
-        """``compute``'s result; its time counts as the stage's, but for the stages that ran inside."""
-        outer, self._inner, start = self._inner, 0.0, time.perf_counter()
-        try:
-            return compute()
-        finally:
-            taken = time.perf_counter() - start
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + taken - self._inner
-            self._inner = outer + taken
 
     def _depth(self, index: int) -> NDArray[np.float32]:
         sample, depth = self.clip[index], self._given_depth(index)
