@@ -16,7 +16,8 @@ from vestcl.forecasting.geometric.forecast import _static, forecast_frames
 from vestcl.forecasting.geometric.memory import SceneMemory, remember
 from vestcl.forecasting.geometric.render import HOLE, Shown, holes, show
 from vestcl.forecasting.result import Forecast, View
-from vestcl.scene.perception import Perception, Surface
+from vestcl.scene.perceived import Surface
+from vestcl.scene.perception import Perception
 
 NOW, DISTANCE = 6, 20.0
 

@@ -19,7 +19,6 @@ from vestcl.forecasting.result import Forecast, SkippedWork, View
 from vestcl.models.forecaster import Forecaster, perceive_estimated
 from vestcl.models.inference.skipping import Count, Tally
 from vestcl.models.inference.stage_times import REST, STAGES
-from vestcl.prepare.frame import prepare_frame
 
 HEIGHT, WIDTH = 48, 160
 RIGHT = np.eye(4)
@@ -100,7 +99,7 @@ def test_it_is_the_models_own_forecast(start: str, mode: Any) -> None:
     """On what was measured of frames t - 1 and t; a model that starts from rest is told no prior."""
     network = model(start)
     result = forecast_frames(perception(), network, 2, 2, VIEWS, mode=mode, learned="all")
-    prev, cur = (prepare_frame(perception(), index) for index in (1, 2))
+    prev, cur = (perception().seen(index) for index in (1, 2))
     given = network_input(prev, cur, last_motions(prev, cur))
     cameras = [(torch.from_numpy(view.tgt_from_next).float()[None], given.K) for view in VIEWS]
     with torch.inference_mode():

@@ -15,9 +15,9 @@ from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.network.input import as_motion, last_motions, network_input
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.ego_motion import RigidMotion
-from vestcl.prepare.frame import Prepared, prepare_frame
 from vestcl.scene.layers import Layers
 from vestcl.scene.motion.ego_motion import constant_velocity
+from vestcl.scene.perceived import PerceivedFrame
 
 HEIGHT, WIDTH = 8, 12
 
@@ -25,7 +25,7 @@ HEIGHT, WIDTH = 8, 12
 MOTIONS = [turned(0.02, 0.004, -0.003, (0.01, 0.02, -0.9)), turned(0.03, -0.006, 0.002, (0.02, -0.01, -1.1))]
 
 
-def prepared(seed: int, cur_from_prev: NDArray[np.float64] | None, own: bool = False) -> Prepared:
+def prepared(seed: int, cur_from_prev: NDArray[np.float64] | None, own: bool = False) -> PerceivedFrame:
     """A random frame; with ``own`` the two lowest rows are the recording car's."""
     rng = np.random.default_rng(seed)
     image, back = rng.random((2, 3, HEIGHT, WIDTH), np.float32)
@@ -33,7 +33,7 @@ def prepared(seed: int, cur_from_prev: NDArray[np.float64] | None, own: bool = F
     mask = rng.random((1, HEIGHT, WIDTH)) < 0.7
     bonnet = np.zeros((1, HEIGHT, WIDTH), bool)
     bonnet[:, -2:] = own
-    return Prepared(
+    return PerceivedFrame(
         name=f"{seed:03}",
         K=np.array([[20.0, 0, 6.3], [0, 21, 3.8], [0, 0, 1]]),
         layers=Layers(image, depth, mask, np.where(mask, image, back), np.where(mask, depth, depth + 3)),
@@ -43,14 +43,14 @@ def prepared(seed: int, cur_from_prev: NDArray[np.float64] | None, own: bool = F
     )
 
 
-def points(frame: Prepared) -> torch.Tensor:
+def points(frame: PerceivedFrame) -> torch.Tensor:
     """[H W, 3] m."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = np.linalg.inv(frame.K) @ np.stack([x, y, np.ones_like(x)]).reshape(3, -1)
     return torch.from_numpy((rays * frame.layers.depth.reshape(1, -1)).T)
 
 
-def displaced(frame: Prepared, rigid: RigidMotion, velocity: torch.Tensor, intervals: int) -> torch.Tensor:
+def displaced(frame: PerceivedFrame, rigid: RigidMotion, velocity: torch.Tensor, intervals: int) -> torch.Tensor:
     """U = R (x + n v) + t - x [H W, 3] m."""
     start = points(frame)
     moved = start + intervals * velocity[0].flatten(1).mT
@@ -98,7 +98,7 @@ def test_the_last_two_motions_are_told() -> None:
 
 def test_prior_is_the_measured_motion_at_constant_velocity() -> None:
     perception = Perception(street_clip(Street.generate(3), 4, 48, 160, samples=1))
-    prev, cur = prepare_frame(perception, 1), prepare_frame(perception, 2)
+    prev, cur = perception.seen(1), perception.seen(2)
     got = geometry.compose_rigid(*network_input(prev, cur, last_motions(prev, cur)).prior.next_from_cur)[0]
     wanted = constant_velocity([np.linalg.inv(perception.prev_from_cur(index)) for index in (1, 2)])
     np.testing.assert_allclose(got.numpy(), wanted, rtol=0, atol=1e-6)

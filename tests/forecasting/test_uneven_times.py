@@ -29,7 +29,6 @@ from vestcl.io.images import to_pixels
 from vestcl.models.config import configuration
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare.clip import EightBitPerception, frame_keys, prepare_clip
-from vestcl.prepare.frame import prepare_frame
 from vestcl.prepare.prepared import PreparedClip
 from vestcl.scene.motion.ego_motion import constant_velocity
 
@@ -214,7 +213,7 @@ def test_windows_with_a_gap_are_left_out(tmp_path: Path) -> None:
     windows = WindowSet([cache], horizons=(0.5, 0.5))
     assert windows.windows == [(0, 8)] and windows.interval == 0.1
     assert cache.frame(AFTER_GAP).elapsed == 2.5
-    wanted = prepare_frame(EightBitPerception(small), AFTER_GAP)
+    wanted = EightBitPerception(small).seen(AFTER_GAP)
     np.testing.assert_allclose(cache.frame(AFTER_GAP).velocity, wanted.velocity, rtol=1e-3, atol=1e-6)
 
 

@@ -20,7 +20,6 @@ from vestcl.io.video.writing import write_mp4
 from vestcl.prepare import clip as prepare_clip
 from vestcl.prepare.clip import frame_keys
 from vestcl.prepare.files import frame_path
-from vestcl.prepare.frame import prepare_frame
 from vestcl.prepare.prepared import PreparedClip, find_prepared
 from vestcl.scene.estimators import with_estimates
 from vestcl.scene.perception import Perception
@@ -141,7 +140,7 @@ def test_no_frame_is_computed_from_more_than_its_key_tells(folder: Path) -> None
 
         repeated = enumerate((clip.samples[0], *clip.samples, clip.samples[-1]))
         samples = tuple(dataclasses.replace(sample, timestamp=i / 10) for i, sample in repeated)
-        prepare_frame(Perception(Watched(clip.name, clip.kind, samples)), index)
+        Perception(Watched(clip.name, clip.kind, samples)).seen(index)
         assert seen == ({0, 1} if index == 0 else set(range(max(index - prepare_clip.LOOKS_BACK, 0), index + 1)))
 
 

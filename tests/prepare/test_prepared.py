@@ -13,9 +13,9 @@ from vestcl.data.sample import Clip, Sample
 from vestcl.io.images import to_float, to_pixels
 from vestcl.prepare.clip import EightBitPerception, prepare_clip
 from vestcl.prepare.files import frame_path, read_tensors, write_clip, write_frame
-from vestcl.prepare.frame import Prepared, prepare_frame
 from vestcl.prepare.prepared import PreparedClip, find_prepared
 from vestcl.scene.layers import Layers
+from vestcl.scene.perceived import PerceivedFrame
 
 HEIGHT, WIDTH, FRAMES = 48, 160, 3
 
@@ -33,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def noise(tmp_path: Path) -> tuple[Path, Prepared]:
+def noise(tmp_path: Path) -> tuple[Path, PerceivedFrame]:
     """A clip of one frame of noise, of an odd size."""
     rng, (height, width) = np.random.default_rng(0), (7, 9)
     mask = rng.random((1, height, width)) > 0.4
@@ -45,13 +45,13 @@ def noise(tmp_path: Path) -> tuple[Path, Prepared]:
     velocity = np.where(mask, 0, rng.normal(size=(3, height, width)).astype(np.float16)).astype(np.float32)
     own = rng.random((1, height, width)) > 0.7
     K = rng.random((3, 3)) * 0 + np.array([[1 / 3, 0, 4.1], [0, 1 / 7, 3.3], [0, 0, 1]])
-    frame = Prepared("a frame", K, layers, velocity, own, None)
+    frame = PerceivedFrame("a frame", K, layers, velocity, own, None)
     write_frame(tmp_path, 0, "key", frame, None)
     write_clip(tmp_path, Clip("noise", "arrays", (Sample.from_arrays("a frame", image, K),)), ["key"])
     return tmp_path, frame
 
 
-def same(got: Prepared, wanted: Prepared) -> None:
+def same(got: PerceivedFrame, wanted: PerceivedFrame) -> None:
     for field in dataclasses.fields(Layers):
         got_plane, wanted_plane = getattr(got.layers, field.name), getattr(wanted.layers, field.name)
         assert got_plane.dtype == wanted_plane.dtype
@@ -61,7 +61,7 @@ def same(got: Prepared, wanted: Prepared) -> None:
     np.testing.assert_array_equal(got.K, wanted.K)
 
 
-def test_a_frame_of_noise_comes_back_bit_for_bit(noise: tuple[Path, Prepared]) -> None:
+def test_a_frame_of_noise_comes_back_bit_for_bit(noise: tuple[Path, PerceivedFrame]) -> None:
     folder, frame = noise
     clip = PreparedClip.open(folder)
     same(clip.frame(0), frame)
@@ -71,7 +71,7 @@ def test_a_frame_of_noise_comes_back_bit_for_bit(noise: tuple[Path, Prepared]) -
 
 
 @pytest.mark.parametrize("background", [True, False])
-def test_nothing_and_everything_hidden(noise: tuple[Path, Prepared], background: bool) -> None:
+def test_nothing_and_everything_hidden(noise: tuple[Path, PerceivedFrame], background: bool) -> None:
     folder, frame = noise
     layers, mask = frame.layers, np.full_like(frame.layers.mask, background)
     shown = {"background_image": layers.image, "background_depth": layers.depth} if background else {}
@@ -87,7 +87,7 @@ def test_a_street_comes_back(folder: Path) -> None:
     perception = EightBitPerception(truth)
     assert (clip.name, clip.kind, clip.fps, clip.size) == ("street 3", "procedural street", 10, (HEIGHT, WIDTH))
     for index in range(FRAMES):
-        got, wanted = clip.frame(index), prepare_frame(perception, index)
+        got, wanted = clip.frame(index), perception.seen(index)
         for name in ("image", "depth", "mask", "background_depth"):
             np.testing.assert_array_equal(getattr(got.layers, name), getattr(wanted.layers, name))
         np.testing.assert_allclose(got.layers.background_image, wanted.layers.background_image, atol=0.5001 / 255)
@@ -130,7 +130,7 @@ def test_arrays_are_the_readers_own(folder: Path) -> None:
     assert not np.shares_memory(frame.layers.background_depth, frame.layers.depth)
 
 
-def test_only_what_is_asked_for_is_read(noise: tuple[Path, Prepared]) -> None:
+def test_only_what_is_asked_for_is_read(noise: tuple[Path, PerceivedFrame]) -> None:
     """Damage to the depth is no matter to who wants the image."""
     folder, frame = noise
     path = frame_path(folder, 0)
@@ -144,7 +144,7 @@ def test_only_what_is_asked_for_is_read(noise: tuple[Path, Prepared]) -> None:
 
 
 @pytest.mark.parametrize("kept", [0, 5, 100, -1])
-def test_a_truncated_file(noise: tuple[Path, Prepared], kept: int) -> None:
+def test_a_truncated_file(noise: tuple[Path, PerceivedFrame], kept: int) -> None:
     folder, _ = noise
     path = frame_path(folder, 0)
     path.write_bytes(path.read_bytes()[:kept])
@@ -152,7 +152,7 @@ def test_a_truncated_file(noise: tuple[Path, Prepared], kept: int) -> None:
         PreparedClip.open(folder).image(0)
 
 
-def test_a_missing_file_and_one_of_another_run(noise: tuple[Path, Prepared]) -> None:
+def test_a_missing_file_and_one_of_another_run(noise: tuple[Path, PerceivedFrame]) -> None:
     folder, frame = noise
     clip = PreparedClip.open(folder)
     write_frame(folder, 0, "another key", frame, None)
@@ -188,7 +188,7 @@ def test_a_damaged_clip(tmp_path: Path, content: str, message: str) -> None:
         ('"name": "noise"', '"name": "nose"'),
     ],
 )
-def test_a_changed_clip(noise: tuple[Path, Prepared], old: str, new: str) -> None:
+def test_a_changed_clip(noise: tuple[Path, PerceivedFrame], old: str, new: str) -> None:
     """JSON that is whole, with another content than was written."""
     path = noise[0] / "clip.json"
     text = path.read_text()
@@ -208,7 +208,7 @@ def test_a_changed_clip(noise: tuple[Path, Prepared], old: str, new: str) -> Non
         ('"vestcl"', '"vastcl"', "no entry 'vestcl'"),
     ],
 )
-def test_a_changed_header(noise: tuple[Path, Prepared], old: str, new: str, message: str) -> None:
+def test_a_changed_header(noise: tuple[Path, PerceivedFrame], old: str, new: str, message: str) -> None:
     path = frame_path(noise[0], 0)
     content = path.read_bytes()
     assert content.count(old.encode()) == 1
@@ -230,7 +230,7 @@ def test_no_such_frame(folder: Path, index: int) -> None:
             read(index)
 
 
-def test_finding(noise: tuple[Path, Prepared], tmp_path: Path) -> None:
+def test_finding(noise: tuple[Path, PerceivedFrame], tmp_path: Path) -> None:
     about = json.loads((tmp_path / "clip.json").read_text())
     del about["checksum"]  # as files of vestcl 0.3, which can be read
     (tmp_path / "clip.json").unlink()

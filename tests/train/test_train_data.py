@@ -21,8 +21,8 @@ from vestcl.forecasting.network.input import last_motions, network_input
 from vestcl.models.forecaster import Forecaster
 from vestcl.ops.unproject import unproject
 from vestcl.prepare.clip import prepare_clip
-from vestcl.prepare.frame import Prepared
 from vestcl.prepare.prepared import PreparedClip, find_prepared
+from vestcl.scene.perceived import PerceivedFrame
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -46,7 +46,7 @@ class FakeClip:
     def is_whole(self, index: int, steps: int) -> bool:
         return index + steps < self.frames
 
-    def frame(self, index: int) -> Prepared:
+    def frame(self, index: int) -> PerceivedFrame:
         self.touched.add(index)
         return prepared(index, MOTIONS[index % 2] if index else None)
 
@@ -305,7 +305,7 @@ def test_crops_reach_every_edge() -> None:
 class RidingClip(FakeClip):
     """Its second half has the recording car in the two lowest rows."""
 
-    def frame(self, index: int) -> Prepared:
+    def frame(self, index: int) -> PerceivedFrame:
         return prepared(index, MOTIONS[index % 2] if index else None, own=index >= self.frames // 2)
 
 

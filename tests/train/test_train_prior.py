@@ -27,10 +27,10 @@ from vestcl.forecasting.network.input import camera_path, last_motions, network_
 from vestcl.models import config
 from vestcl.models.config import EgoMotionConfig
 from vestcl.models.forecaster import Forecaster
-from vestcl.prepare.frame import Prepared
 from vestcl.prepare.prepared import PreparedClip
 from vestcl.scene.inputs import Inputs
 from vestcl.scene.motion.camera_forecast import forecast_camera
+from vestcl.scene.perceived import PerceivedFrame
 
 BOUNDED = dataclasses.replace(
     SMALL,
@@ -61,7 +61,7 @@ class Driving(FakeClip):
         self.read.append(index)
         return np.asarray(np.linalg.inv(self.motion(index)), np.float64)
 
-    def frame(self, index: int) -> Prepared:
+    def frame(self, index: int) -> PerceivedFrame:
         return prepared(index, self.motion(index) if index else None)
 
 

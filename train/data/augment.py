@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from vestcl import geometry
 from vestcl.data.resize import resize_image, resize_labels
 from vestcl.forecasting.network.input import CameraPath
-from vestcl.prepare.frame import Prepared
 from vestcl.scene.layers import Layers
+from vestcl.scene.perceived import PerceivedFrame
 
 Element = TypeVar("Element", bound=np.generic)
 Value = TypeVar("Value")
@@ -39,9 +39,9 @@ _MIRROR: Final = np.diag([-1.0, 1.0, 1.0, 1.0])
 class TrainingWindow:
     """Two frames of a clip and what is to be forecast from them, all of one size."""
 
-    prev: Prepared
+    prev: PerceivedFrame
     """At t - 1."""
-    cur: Prepared
+    cur: PerceivedFrame
     """At t."""
     target: NDArray[np.float32]
     """[3, H, W] RGB in [0, 1], at t + k."""
@@ -220,7 +220,7 @@ def _mapped(
 ) -> TrainingWindow:
     """The window with its pictures, its other planes (depths, masks, velocities) and its K changed."""
 
-    def frame(frame: Prepared) -> Prepared:
+    def frame(frame: PerceivedFrame) -> PerceivedFrame:
         changed = {
             field.name: (picture if "image" in field.name else planes)(getattr(frame.layers, field.name))
             for field in fields(Layers)
@@ -260,7 +260,7 @@ def _mirror_path(path: CameraPath) -> CameraPath:
     return path._replace(future_from_cur=tuple(map(_conjugate, path.future_from_cur)), measured=path.measured * signs)
 
 
-def _mirror_motion(frame: Prepared) -> Prepared:
+def _mirror_motion(frame: PerceivedFrame) -> PerceivedFrame:
     """A frame's velocities and motion, seen in the mirror."""
     velocity = frame.velocity * np.array([-1, 1, 1], np.float32)[:, None, None]
     known = frame.prev_from_cur

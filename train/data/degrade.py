@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from train.data.augment import LUMA, Matrix, TrainingWindow
 from train.settings.config import DegradeConfig
-from vestcl.prepare.frame import Prepared
+from vestcl.scene.perceived import PerceivedFrame
 
 Image = NDArray[np.float32]
 
@@ -75,7 +75,7 @@ def draw(rng: np.random.Generator, settings: DegradeConfig) -> Degradation | Non
     )
 
 
-def blur(window: TrainingWindow, later: Prepared, shutter: float) -> TrainingWindow:
+def blur(window: TrainingWindow, later: PerceivedFrame, shutter: float) -> TrainingWindow:
     """Frames and target blurred along what they show moves: the mean over tau in shutter [-1/2, 1/2] of I(p + tau u).
 
     u = project(K (R (x - v) + t)) - p is the flow to the frame before, from depth, camera motion and the velocity v of
@@ -119,7 +119,7 @@ def degrade(window: TrainingWindow, done: Degradation, rng: np.random.Generator)
     )
 
 
-def flow_to_prev(frame: Prepared, prev_from_cur: Matrix, depth: Image, velocity: Image | None) -> Image:
+def flow_to_prev(frame: PerceivedFrame, prev_from_cur: Matrix, depth: Image, velocity: Image | None) -> Image:
     """u [2, H, W] px to where each pixel's point was in the frame before, an interval ago.
 
     Args:
@@ -141,7 +141,7 @@ def flow_to_prev(frame: Prepared, prev_from_cur: Matrix, depth: Image, velocity:
     return flow.astype(np.float32)
 
 
-def _blurred(frame: Prepared, prev_from_cur: Matrix, shutter: float) -> Prepared:
+def _blurred(frame: PerceivedFrame, prev_from_cur: Matrix, shutter: float) -> PerceivedFrame:
     layers = frame.layers
     velocity = np.where(frame.own, 0, frame.velocity).astype(np.float32)
     flow = np.where(frame.own, np.float32(0), flow_to_prev(frame, prev_from_cur, layers.depth, velocity))
@@ -164,8 +164,8 @@ def _along(image: Image, flow: Image, shutter: float) -> Image:
 
 
 def _degraded(
-    frame: Prepared, gain: tuple[float, float, float], done: Degradation, rng: np.random.Generator
-) -> Prepared:
+    frame: PerceivedFrame, gain: tuple[float, float, float], done: Degradation, rng: np.random.Generator
+) -> PerceivedFrame:
     """The background is exposed as the image is, and is the image where that shows it."""
     layers = frame.layers
     image = _exposed(layers.image, gain, done.grey)

@@ -27,8 +27,39 @@ from vestcl.data.sources import (
 from vestcl.io.labels import background
 
 
+class _CameraImage:
+    """An image and its camera, read at any size: what `Sample` and `RightCamera` share."""
+
+    image: ImageSource
+    K: NDArray[np.float64]
+    size: tuple[int, int] | None
+
+    @property
+    def height(self) -> int:
+        """Px, of whatever is read."""
+        return self.size[0] if self.size else self.image.height
+
+    @property
+    def width(self) -> int:
+        """Px, of whatever is read."""
+        return self.size[1] if self.size else self.image.width
+
+    def read_image(self) -> NDArray[np.float32]:
+        """[3, height, width] RGB in [0, 1]: mean over area where it shrinks, bilinear where it grows.
+
+        Raises:
+            ValueError: the file is missing, damaged or of another size than its clip.
+        """
+        return resize.resize_image(self.image.read(), self.height, self.width)
+
+    def resized_intrinsics(self, height: int, width: int) -> NDArray[np.float64]:
+        """diag(sx, sy, 1) K of the image at another size, [3, 3] px."""
+        sx, sy = width / self.width, height / self.height
+        return geometry.scale_intrinsics(torch.from_numpy(self.K), sx, sy).numpy()
+
+
 @dataclass(frozen=True, eq=False)
-class RightCamera:
+class RightCamera(_CameraImage):
     """The second camera of a stereo rig, at the same time."""
 
     image: ImageSource
@@ -42,24 +73,6 @@ class RightCamera:
     def __post_init__(self) -> None:
         calibration.check_intrinsics(self.K, "right camera")
         calibration.check_rigid(self.right_from_left, "right camera: right_from_left")
-
-    @property
-    def height(self) -> int:
-        """Px, of what `read_image` gives."""
-        return self.size[0] if self.size else self.image.height
-
-    @property
-    def width(self) -> int:
-        """Px, of what `read_image` gives."""
-        return self.size[1] if self.size else self.image.width
-
-    def read_image(self) -> NDArray[np.float32]:
-        """[3, height, width] RGB in [0, 1].
-
-        Raises:
-            ValueError: the file is missing, damaged or of another size than its clip.
-        """
-        return resize.resize_image(self.image.read(), self.height, self.width)
 
     def read_as(self, K: NDArray[np.float64], height: int, width: int) -> NDArray[np.float32]:
         """[3, height, width] RGB in [0, 1] as the same camera with another K would see it; black outside its image.
@@ -82,12 +95,11 @@ class RightCamera:
 
     def resized(self, height: int, width: int) -> "RightCamera":
         """The same camera at another size, with diag(sx, sy, 1) K."""
-        K = _scaled(self.K, width / self.width, height / self.height)
-        return replace(self, K=K, size=(height, width))
+        return replace(self, K=self.resized_intrinsics(height, width), size=(height, width))
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class Sample(_CameraImage):
     """One frame and what is known about it. Everything is over the same field of view, at ``height`` x ``width``."""
 
     name: str
@@ -155,24 +167,6 @@ class Sample:
             labels=None if train_ids is None else LabelArray(_planes("train_ids", train_ids, np.uint8, 1)),
         )
 
-    @property
-    def height(self) -> int:
-        """Px, of whatever is read."""
-        return self.size[0] if self.size else self.image.height
-
-    @property
-    def width(self) -> int:
-        """Px, of whatever is read."""
-        return self.size[1] if self.size else self.image.width
-
-    def read_image(self) -> NDArray[np.float32]:
-        """[3, height, width] RGB in [0, 1]: mean over area where it shrinks, bilinear where it grows.
-
-        Raises:
-            ValueError: the file is missing, damaged or of another size than its clip.
-        """
-        return resize.resize_image(self.image.read(), self.height, self.width)
-
     def read_depth(self) -> NDArray[np.float32]:
         """[1, height, width] m, valid iff > 0: nearest valid source pixel, see `resize.resize_depth`.
 
@@ -218,9 +212,8 @@ class Sample:
             ValueError: a size that is not a positive integer.
         """
         resize.check_size(height, width)
-        K = _scaled(self.K, width / self.width, height / self.height)
         right = None if self.right is None else self.right.resized(height, width)
-        return replace(self, K=K, size=(height, width), right=right)
+        return replace(self, K=self.resized_intrinsics(height, width), size=(height, width), right=right)
 
     def _read(self, source: Any, name: str, resized: Callable[[Any, int, int], Any]) -> Any:
         if source is None:
@@ -354,10 +347,6 @@ class Clip(Sequence[Sample]):
 
     def _mapped(self, samples: Iterable[Sample]) -> "Clip":
         return replace(self, samples=tuple(samples))
-
-
-def _scaled(K: NDArray[np.float64], sx: float, sy: float) -> NDArray[np.float64]:
-    return geometry.scale_intrinsics(torch.from_numpy(K), sx, sy).numpy()
 
 
 def _planes(name: str, value: ArrayLike, dtype: type[np.generic], channels: int) -> NDArray[Any]:

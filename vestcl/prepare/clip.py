@@ -20,7 +20,6 @@ from vestcl.io.atomic import read_bytes
 from vestcl.io.images import to_float, to_pixels
 from vestcl.io.video.reading import Video
 from vestcl.prepare.files import JSON, RECIPE, Shape, frame_path, restore_frame, write_clip, write_frame
-from vestcl.prepare.frame import prepare_frame
 from vestcl.scene.inpainting.inpainters import Inpainter
 from vestcl.scene.inputs import Inputs
 from vestcl.scene.perception import Perception
@@ -136,7 +135,7 @@ def _complete(
 
 def _write(clip: Clip, perception: Perception, folder: Path, index: int, key: str, clock: Clock) -> None:
     """Compute and write a frame; ``clock`` has what perception's has not."""
-    frame, camera = prepare_frame(perception, index), clip[index].right
+    frame, camera = perception.seen(index), clip[index].right
     with clock.stage("right"):
         right = None if camera is None else camera.read_image()
     with clock.stage("write"), _explained(frame_path(folder, index)):

@@ -29,8 +29,8 @@ from safetensors.numpy import save
 from vestcl.data.sample import Clip, Sample
 from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.io.images import to_pixels
-from vestcl.prepare.frame import Prepared
 from vestcl.scene.inputs import Inputs, inputs_of
+from vestcl.scene.perceived import PerceivedFrame
 
 #: Raised when perception, the procedural street or these files change: it makes every frame be computed anew.
 RECIPE: Final = "vestcl prepared 4"
@@ -70,7 +70,7 @@ def frame_path(folder: Path, index: int) -> Path:
     return folder / f"{index:06}.safetensors"
 
 
-def write_frame(folder: Path, index: int, key: str, frame: Prepared, right: NDArray[np.float32] | None) -> None:
+def write_frame(folder: Path, index: int, key: str, frame: PerceivedFrame, right: NDArray[np.float32] | None) -> None:
     """Replace a frame's file in one step.
 
     Args:
@@ -180,7 +180,7 @@ def _facts(sample: Sample, key: str) -> dict[str, Any]:
     }
 
 
-def _packed(frame: Prepared, right: NDArray[np.float32] | None) -> dict[str, Array]:
+def _packed(frame: PerceivedFrame, right: NDArray[np.float32] | None) -> dict[str, Array]:
     layers, hidden, velocity = frame.layers, ~frame.layers.mask[0], frame.velocity.astype(np.float16)
     moving = (velocity != 0).any(0)
     tensors: dict[str, Array] = {

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip, RightCamera, Sample
-from vestcl.prepare.frame import Prepared
 from vestcl.prepare.prepared import PreparedClip
 from vestcl.scene.inpainting.inpainters import Inpainter
 from vestcl.scene.motion import objects
-from vestcl.scene.perception import Moving, Perception, Seen, Surface
+from vestcl.scene.perceived import Moving, PerceivedFrame, Surface
+from vestcl.scene.perception import Perception
 
 Element = TypeVar("Element", np.float32, np.bool_)
 
@@ -47,7 +47,7 @@ class _Part(Generic[Element]):
 
     clip: PreparedClip
     index: int
-    take: Callable[[Prepared], NDArray[Element]]
+    take: Callable[[PerceivedFrame], NDArray[Element]]
 
     def read(self) -> NDArray[Element]:
         """[1, H, W]."""
@@ -116,37 +116,32 @@ class PreparedPerception(Perception):
 
     def raw_depth(self, index: int) -> NDArray[np.float32]:
         """[1, H, W] m, complete."""
-        return self._frame_of(index).layers.depth
+        return self.seen(index).layers.depth
 
     def prev_from_cur(self, index: int) -> NDArray[np.float64]:
         """[4, 4] m: the camera's motion from frame ``index`` to the one before."""
-        motion = self._frame_of(index).prev_from_cur
+        motion = self.seen(index).prev_from_cur
         if motion is None:
             raise ValueError(f"`index` must be 1 or more, a frame of {self.clip.name} with one before, got {index}")
         return motion
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """M [1, H, W], True = static background."""
-        return self._frame_of(index).layers.mask
+        return self.seen(index).layers.mask
 
-    def seen(self, index: int) -> Seen:
-        """The frame's layers and objects."""
-        return self.once("layers", index, lambda: self._seen(index))
+    def seen(self, index: int) -> PerceivedFrame:
+        """The frame as it is in the cache."""
+        return self.once("prepared frame", index, lambda: self._prepared.frame(index))
 
     def surface(self, index: int) -> Surface:
         """What the frame shows."""
-        frame = self._frame_of(index)
+        frame = self.seen(index)
         return Surface(frame.layers.image, frame.layers.depth, frame.layers.mask, frame.own)
 
     def moving(self, index: int) -> Moving:
         """The frame's objects."""
-        seen = self.seen(index)
-        return Moving(seen.things, seen.velocity)
+        return self.once("layers", index, lambda: self._moving(index))
 
-    def _seen(self, index: int) -> Seen:
-        frame = self._frame_of(index)
-        objects_of = objects.segment(frame.layers.mask, frame.layers.depth)
-        return Seen(frame.layers, objects_of, frame.velocity, frame.own)
-
-    def _frame_of(self, index: int) -> Prepared:
-        return self.once("prepared frame", index, lambda: self._prepared.frame(index))
+    def _moving(self, index: int) -> Moving:
+        frame = self.seen(index)
+        return Moving(objects.segment(frame.layers.mask, frame.layers.depth), frame.velocity)

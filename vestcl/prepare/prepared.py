@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from vestcl import times
 from vestcl.prepare.files import ALWAYS, DAMAGE, JSON, damaged, frame_path, read_clip, read_tensors
-from vestcl.prepare.frame import Prepared
 from vestcl.scene.inputs import Inputs
 from vestcl.scene.layers import Layers
+from vestcl.scene.perceived import PerceivedFrame
 
 #: Characters that make the last part of a path a pattern.
 _GLOB: Final = frozenset("*?[")
@@ -145,11 +145,11 @@ class PreparedClip:
             raise damaged(frame_path(self.folder, index), wrong)
         return _to_float(pixels), known.right[0].copy(), known.right[1].copy()
 
-    def frame(self, index: int) -> Prepared:
+    def frame(self, index: int) -> PerceivedFrame:
         """All that is known of the frame ``index``, from 0.
 
         Returns:
-            As `prepare_frame`, with colours of 8 bits and velocities of 16.
+            As `Perception.seen`, with colours of 8 bits and velocities of 16.
 
         Raises:
             ValueError: no such frame, or its file is missing or damaged.
@@ -164,7 +164,7 @@ class PreparedClip:
         _fill(velocity, moving, tensors["velocity"])
         layers = Layers(image, depth, mask, background_image, background_depth)
         motion_back = tensors.get("prev_from_cur")
-        return Prepared(known.name, known.K.copy(), layers, velocity, own, motion_back, self.elapsed(index))
+        return PerceivedFrame(known.name, known.K.copy(), layers, velocity, own, motion_back, self.elapsed(index))
 
     def _frame(self, index: int) -> _Frame:
         if not 0 <= index < len(self):

@@ -4,7 +4,6 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -31,6 +30,7 @@ from vestcl.scene.motion.observable import on_the_road
 from vestcl.scene.motion.outline import whole_objects
 from vestcl.scene.motion.photometric import Pair, confirmed, search
 from vestcl.scene.own_car import own_car
+from vestcl.scene.perceived import Moving, PerceivedFrame, Surface
 from vestcl.scene.sky import sky_mask
 
 #: Standard deviation of a stereo pair's disparity, px, and the nearest depth that is searched for, m.
@@ -55,41 +55,6 @@ _KEPT: Final = 4
 _LOG: Final = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """What a frame shows, without what is behind its foreground: `Seen` is computed from it."""
-
-    image: NDArray[np.float32]
-    """[3, H, W] RGB in [0, 1]."""
-    depth: NDArray[np.float32]
-    """[1, H, W] m, above 0 everywhere."""
-    mask: NDArray[np.bool_]
-    """M [1, H, W], True = static background."""
-    own: NDArray[np.bool_]
-    """[1, H, W], True where the recording car itself is in the image."""
-
-
-@dataclass(frozen=True, eq=False)
-class Moving:
-    """The objects of a frame: `things` and `velocity` of `Seen`."""
-
-    things: NDArray[np.int32]
-    velocity: NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """One frame, understood."""
-
-    layers: Layers
-    things: NDArray[np.int32]
-    """[H, W], 0 = background, else the thing."""
-    velocity: NDArray[np.float32]
-    """[3, H, W] m per interval of the clip, in the camera's axes, of what each pixel shows; 0 where it is static."""
-    own: NDArray[np.bool_]
-    """[1, H, W], True where the recording car itself is in the picture."""
 
 
 class Perception:
@@ -213,11 +178,15 @@ class Perception:
         return self._part("surface", index, lambda: self._find_surface(index))
 
     def moving(self, index: int) -> Moving:
-        """The frame's objects, as in `seen`."""
+        """The frame's objects and their velocities."""
         return self._part("moving", index, lambda: self._find_moving(index))
 
-    def seen(self, index: int) -> Seen:
-        """The frame's layers and things."""
+    def seen(self, index: int) -> PerceivedFrame:
+        """The frame's layers, velocities and camera motion.
+
+        Raises:
+            ValueError: a file missing or damaged, or no depth to be had.
+        """
         return self.once("layers", index, lambda: self._see(index))
 
     def frame(self, index: int) -> backtest.BacktestFrame:
@@ -449,13 +418,12 @@ class Perception:
         velocity = confirmed(by_flow, velocity, surface.depth, pair)
         return Moving(things, velocity / np.float32(self.clip.elapsed(index)))
 
-    def _see(self, index: int) -> Seen:
+    def _see(self, index: int) -> PerceivedFrame:
         surface, complete = self.surface(index), self._complete_depth(index)
         behind_image, behind_depth = inpaint_background(surface.image, complete, surface.mask, method=self.inpaint)
         if self.clip[index].ego_vehicle is None and surface.own.any():
             behind_depth = np.where(surface.own, behind_depth.clip(max=_BONNET), behind_depth)
-        layers, moving = (
-            Layers(surface.image, surface.depth, surface.mask, behind_image, behind_depth),
-            self.moving(index),
-        )
-        return Seen(layers, moving.things, moving.velocity, surface.own)
+        layers = Layers(surface.image, surface.depth, surface.mask, behind_image, behind_depth)
+        velocity, sample, elapsed = self.moving(index).velocity, self.clip[index], self.clip.elapsed(index)
+        motion = self.prev_from_cur(index) if index > 0 else None
+        return PerceivedFrame(sample.name, sample.K, layers, velocity, surface.own, motion, elapsed)

@@ -12,7 +12,6 @@ from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.network.input import NetworkInput, last_motions, network_input
 from vestcl.models.inference.resolution import fraction, reduced
 from vestcl.models.networks.layers import mapped
-from vestcl.prepare.frame import prepare_frame
 from vestcl.scene.layers import LayerBatch
 
 #: The current frame t: from t - 2 and t - 1 before it the change of the camera's motion is known.
@@ -51,7 +50,7 @@ def scene(seed: int, height: int, width: int, steps: int) -> Scene:
     """
     clip = street_clip(Street.generate(seed), CURRENT + 1 + steps, height, width, start=START, samples=SAMPLES)
     perception = Perception(clip)
-    prev, cur = (prepare_frame(perception, index) for index in (CURRENT - 1, CURRENT))
+    prev, cur = (perception.seen(index) for index in (CURRENT - 1, CURRENT))
     frames = [torch.from_numpy(clip[CURRENT + step].read_image()) for step in range(1, steps + 1)]
     return Scene(seed, network_input(prev, cur, last_motions(prev, cur)), torch.stack(frames))
 

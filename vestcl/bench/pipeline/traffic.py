@@ -22,8 +22,8 @@ from vestcl.data import Street, street_clip
 from vestcl.data.street.driving.drive import MAX_CHANGE, Sway
 from vestcl.forecasting.network.input import NetworkInput, last_motions, network_input
 from vestcl.models.steps.prior import nothing_moves
-from vestcl.prepare.frame import Prepared, prepare_frame
 from vestcl.scene.layers import LayerBatch
+from vestcl.scene.perceived import PerceivedFrame
 from vestcl.scene.perception import Perception
 
 EMPTY: Final = "empty road"
@@ -106,19 +106,19 @@ def street(name: str, seed: int) -> Street:
     return dataclasses.replace(usual, crowded=True, drive=Sway(_JAM_SPEED, float(seed), _JAM_SPEED / MAX_CHANGE))
 
 
-def _prepared(name: str, height: int, width: int, frames: int, seed: int) -> Iterator[Prepared]:
+def _prepared(name: str, height: int, width: int, frames: int, seed: int) -> Iterator[PerceivedFrame]:
     clip = street_clip(street(name, seed), frames, height, width, foreground=name != EMPTY)
     perception = Perception(clip)
-    return (prepare_frame(perception, index) for index in range(frames))
+    return (perception.seen(index) for index in range(frames))
 
 
-def _slid(frames: list[Prepared]) -> Iterator[Window]:
+def _slid(frames: list[PerceivedFrame]) -> Iterator[Window]:
     for prev, cur, after in zip(frames, frames[1:], frames[2:], strict=False):
         given = network_input(prev, cur, last_motions(prev, cur))
         yield Window(given, torch.eye(4)[None], torch.from_numpy(after.layers.image.copy())[None])
 
 
-def _scattered(frames: list[Prepared]) -> Iterator[Window]:
+def _scattered(frames: list[PerceivedFrame]) -> Iterator[Window]:
     """Two windows without a common frame, so that none was seen in the step before."""
     K, aside = torch.from_numpy(frames[0].K[None]).float(), torch.eye(4)[None]
     aside[:, 0, 3] = -_ASIDE

@@ -16,7 +16,8 @@ from vestcl.constants import SKY_DEPTH
 from vestcl.scene.depth.road_plane import linear
 from vestcl.scene.exposure import STRIDE, nearest, tone_curve
 from vestcl.scene.morphology import dilated
-from vestcl.scene.perception import Perception, Surface
+from vestcl.scene.perceived import Surface
+from vestcl.scene.perception import Perception
 
 #: Frames before t-1 that are remembered if nothing else is asked for; `docs/memory.md` has the figures.
 MEMORY: Final = 3

@@ -76,7 +76,7 @@ def _tested_paths(perception: Perception, index: int) -> Paths:
         errors.append(backtest.backtest(positions, before, perception.image(index), flows))
     if index == 1:
         errors = [backtest.untested(perception.frame(index), by_flow)]
-    objects = perception.seen(index).things
+    objects = perception.moving(index).things
     held = [backtest.held_together(each, objects) for each in backtest.by_step(errors, by_flow)]
     return Paths(perception.frame(index), tuple(held), by_flow)
 

@@ -20,7 +20,6 @@ from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
 from vestcl.models.inference.skipping import Count, Tally, count_skips
 from vestcl.models.inference.stage_times import watching, with_rest
-from vestcl.prepare.frame import prepare_frame
 from vestcl.scene.inpainting.inpainters import Inpainter
 from vestcl.scene.perception import Perception
 
@@ -155,7 +154,7 @@ def _composed(
     note = interval_note(perception.clip, index, model.config)
     known = note is None and interval_note(perception.clip, max(index - 1, 1), model.config) is None
     paths = point_paths(perception, index)
-    prepare_frame(perception, index - 1)
+    perception.seen(index - 1)
     tell("network")
     clock = _Clock(perception)
     with torch.inference_mode(), watching() as watch, count_skips() as tally:

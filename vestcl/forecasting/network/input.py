@@ -13,11 +13,11 @@ from vestcl import geometry
 from vestcl.models.networks.camera_correction import INTERVAL, MEASURED, rates_of
 from vestcl.models.networks.rigid_motion import RigidMotion
 from vestcl.models.steps.prior import MotionPrior
-from vestcl.prepare.frame import Prepared
 from vestcl.scene import checked
 from vestcl.scene.layers import LayerBatch, batch
 from vestcl.scene.motion.camera_forecast import forecast_camera
 from vestcl.scene.motion.ego_motion import constant_velocity
+from vestcl.scene.perceived import PerceivedFrame
 
 #: So many last motions count in a path, as in the geometric forecast.
 PAST: Final = MEASURED
@@ -50,7 +50,7 @@ class NetworkInput(NamedTuple):
 
 
 def network_input(
-    prev: Prepared, cur: Prepared, motions: Sequence[NDArray[np.float64]], path: CameraPath | None = None
+    prev: PerceivedFrame, cur: PerceivedFrame, motions: Sequence[NDArray[np.float64]], path: CameraPath | None = None
 ) -> NetworkInput:
     """Two prepared frames with their motion prior: the camera's motion, and constant velocity of all dynamic objects.
 
@@ -145,7 +145,7 @@ def _later(future_from_cur: Sequence[NDArray[np.float64]]) -> RigidMotion:
     return RigidMotion(*(torch.stack(parts, dim=1) for parts in zip(*each, strict=True)))
 
 
-def last_motions(*frames: Prepared) -> list[NDArray[np.float64]]:
+def last_motions(*frames: PerceivedFrame) -> list[NDArray[np.float64]]:
     """``cur_from_prev`` [4, 4] m of each frame that has a ``prev_from_cur``: all but a clip's first, oldest first.
 
     Args:
@@ -165,7 +165,7 @@ def as_motion(dst_from_src: NDArray[np.float64]) -> RigidMotion:
     return RigidMotion(geometry.matrix_to_quaternion(rigid[:, :3, :3]).float(), rigid[:, :3, 3].float())
 
 
-def _velocity(frame: Prepared, next_from_src: NDArray[np.float64], intervals: float) -> NDArray[np.float32]:
+def _velocity(frame: PerceivedFrame, next_from_src: NDArray[np.float64], intervals: float) -> NDArray[np.float32]:
     """[3, H, W] m per interval: the frame's, but the recording car stays where it is in the picture."""
     if not frame.own.any():
         return np.array(frame.velocity, np.float32)

@@ -21,7 +21,6 @@ from vestcl.forecasting.result import LearnedPart, Rendered, View
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.stage_times import watching
 from vestcl.models.steps.render import looks_of
-from vestcl.prepare.frame import prepare_frame
 from vestcl.scene.perception import Perception
 
 Learned = Literal["tested", "all"]
@@ -76,7 +75,7 @@ def given_input(perception: Perception, index: int, prior: str, steps: int = 1, 
         steps: intervals that the camera's motion is forecast for.
         back: frames after ``index`` that are looked at anyway: as many of the last motions are left out.
     """
-    prev, cur = prepare_frame(perception, index - 1), prepare_frame(perception, index)
+    prev, cur = perception.seen(index - 1), perception.seen(index)
     path = forecast_path(perception, index, steps, back) if prior == "forecast" else None
     return network_input(prev, cur, last_motions(prev, cur), path)
 
@@ -90,7 +89,7 @@ def forecast_path(perception: Perception, index: int, steps: int, back: int = 0)
 
 def given_motion(perception: Perception, index: int, path: CameraPath) -> NetworkInput:
     """`given_input` with another motion of the camera, ``path``."""
-    prev, cur = prepare_frame(perception, index - 1), prepare_frame(perception, index)
+    prev, cur = perception.seen(index - 1), perception.seen(index)
     return network_input(prev, cur, last_motions(prev, cur), path)
 
 
