@@ -14,7 +14,6 @@ from st_lpips_weights import public_state
 from stand_ins import put_module
 
 from vestcl import opencl
-from vestcl.cli import clip as clip_command
 from vestcl.cli import main as cli
 from vestcl.data import Street
 from vestcl.data.sample import Clip, Sample
@@ -196,13 +195,13 @@ def test_street(
 ) -> None:
     wanted = []
 
-    def clip(street: Street, frames: int, height: int, width: int) -> Clip:
+    def clip(street: Street, frames: int, height: int, width: int, **_: Any) -> Clip:
         wanted.append((street.seed, frames, (height, width)))
         K = np.array([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
         image = np.zeros((3, HEIGHT, WIDTH))
         return Clip("street", "street", tuple(Sample.from_arrays(f"{i}", image, K) for i in range(frames)))
 
-    monkeypatch.setattr(clip_command, "street_clip", clip)
+    monkeypatch.setattr("vestcl.data.street.input.street_clip", clip)
     assert cli.main(["forecast", "street:7", "--out", str(tmp_path / "out"), *told.split()]) == 0
     assert wanted == [(7, frames, size)]
     assert repeater.calls[0][1] == index

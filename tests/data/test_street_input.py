@@ -149,7 +149,7 @@ def test_each_source_is_prepared(session: opencl.Session, tmp_path: Path, capsys
     assert cli.main([*arguments, "--samples", "1"]) == 0
     assert "0 frames computed, 9 kept" in capsys.readouterr().out
     found = {clip.name.partition("depth=")[2].split()[0]: clip for clip in find_prepared(tmp_path)}
-    assert all(clip.has_right and clip.right(1) is not None for clip in found.values())
+    assert all(all(clip.right_camera(index) is not None for index in range(len(clip))) for clip in found.values())
     assert [
         clip.inputs and (clip.inputs.depth, clip.inputs.masks, clip.inputs.stereo) for _, clip in sorted(found.items())
     ] == [

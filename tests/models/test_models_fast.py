@@ -263,3 +263,4 @@ def test_freed_memory_is_kept_with_glibc_alone(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr(platform, "libc_ver", lambda library=library: (library, "2.39"))
         assert fast.keep_freed_memory() is (library == "glibc")
     assert called == [(-4, 0), (-1, 2**31 - 1)]
+    assert fast.keep_freed_memory(False) and called[2:] == [(-4, 65536), (-1, 128 * 1024)]

@@ -67,7 +67,7 @@ def test_a_frame_of_noise_comes_back_bit_for_bit(noise: tuple[Path, PerceivedFra
     same(clip.frame(0), frame)
     assert clip.frame(0).name == clip.frame_name(0) == "a frame" and clip.frame(0).prev_from_cur is None
     assert (clip.name, clip.kind, clip.fps, clip.size, len(clip)) == ("noise", "arrays", None, (7, 9), 1)
-    assert clip.right(0) is None and not clip.has_right and clip.world_from_cam(0) is None
+    assert clip.right(0) is None and clip.right_camera(0) is None and clip.world_from_cam(0) is None
 
 
 @pytest.mark.parametrize("background", [True, False])
@@ -113,7 +113,7 @@ def test_the_background_is_never_nearer_and_differs_only_where_it_is_hidden(fold
 
 def test_the_right_camera(folder: Path) -> None:
     clip, camera = PreparedClip.open(folder), street()[1].right
-    assert camera is not None and clip.has_right
+    assert camera is not None and clip.right_camera(0) is not None
     right = clip.right(1)
     assert right is not None
     np.testing.assert_array_equal(right[0], to_float(to_pixels(camera.read_image())))

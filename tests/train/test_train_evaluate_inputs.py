@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from evaluated_inputs import known_of
 from forecaster_scenes import TINY, stir
 
 from train.evaluation.inputs import (
@@ -14,7 +15,6 @@ from train.evaluation.inputs import (
     check_stereo,
     depths,
     given,
-    known_of,
     label_of,
     plain,
     sentences,

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from evaluated_inputs import known_of
 from forecaster_scenes import TINY, stir
 from st_lpips_weights import public_state
 
-from train.evaluation.inputs import PAIR, known_of
+from train.evaluation.inputs import PAIR
 from train.evaluation.protocols import NOW, PROTOCOLS
 from train.evaluation.windows import CAMERA, Setup, forecast, perceptions_of, prepared, presenters, views_of, window
 from vestcl.data import Street, street_clip

@@ -192,16 +192,6 @@ def sentences(by_clip: Mapping[str, Mapping[str, Inputs]]) -> tuple[str, ...]:
     return tuple(f"{_listed(clips)}: {' '.join(told)}" for told, clips in groups.items())
 
 
-def known_of(clip: Clip, sources: tuple[Depth, ...] = ("clip",)) -> str:
-    """The first sentence, of one clip.
-
-    Args:
-        clip: at the size that is evaluated.
-        sources: of `depths`.
-    """
-    return _sentences({label(depth): inputs_of(given(clip, depth)) for depth in sources})[0]
-
-
 def _sentences(by_label: Mapping[str, Inputs]) -> tuple[str, ...]:
     depth = " and from ".join(inputs.depth + _ending(inputs.stereo) for inputs in by_label.values())
     motion = {inputs.motion: _ending(inputs.stereo) for inputs in by_label.values()}

@@ -5,7 +5,6 @@ from typing import Final, NamedTuple
 from vestcl.cli import checks
 from vestcl.cli.commands import ClipOptions
 from vestcl.cli.options import check_pixels
-from vestcl.data import street_clip
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
@@ -59,19 +58,12 @@ def open_clip(
             raise ValueError(f"{text}: is a street, which takes height, width, not {', '.join(wrong)}")
         if street.driven.depth or street.driven.masks:
             raise ValueError(f"{text}: must have no depth and masks here; `vestcl prepare` takes them")
-        return with_estimates(_street(street.seeds[0], street.driven, street_frames, size), estimators)
+        height, width = (given or usual for given, usual in zip(size, STREET_SIZE, strict=True))
+        clip = street_input.clip(street.seeds[0], street.driven, street_frames, (height, width))
+        return with_estimates(clip, estimators)
     checks.check_folders(options)
     check_pixels(*size)
     return with_estimates(open_sequence(text, **files, **layout).fitted(*size), estimators)
-
-
-def _street(seed: int, driven: street_input.Driven, frames: int, size: tuple[int | None, int | None]) -> Clip:
-    height, width = (given or usual for given, usual in zip(size, STREET_SIZE, strict=True))
-    made, start = street_input.street(seed, driven)
-    if driven == street_input.USUAL:
-        return street_clip(made, frames, height, width)
-    fps = float(driven.drawn(seed).fps or street_input.USUAL_RATE)
-    return street_clip(made, frames, height, width, start=start, fps=fps)
 
 
 def load_estimators(depth_model: str | None, mask_model: str | None) -> Estimators:

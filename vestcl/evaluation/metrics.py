@@ -4,7 +4,7 @@ Every function answers with one number an image or sample, [B]; the mean over a 
 number is undefined (nothing visible, a car that stands still) it is NaN, so take means with `torch.nanmean`.
 """
 
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 from torch.nn import functional
@@ -28,9 +28,6 @@ MS_SSIM_SIDE: Final = WINDOW << (len(LEVEL_WEIGHTS) - 1)
 #: A car that moves less than this between two frames (metres) stands: an error in per cent of it means nothing.
 STANDSTILL: Final = 0.01
 
-Windows = Literal["all", "centre"]
-"""Which windows count as inside a mask: those with all of their pixels inside, or with their centre inside."""
-
 
 class EgoMotionError(NamedTuple):
     """What `ego_motion_error` returns, [B] each."""
@@ -42,7 +39,7 @@ class EgoMotionError(NamedTuple):
 def quantise(image: torch.Tensor) -> torch.Tensor:
     """round(255 clamp(x, 0, 1)) / 255: the image as an 8-bit file holds it.
 
-    Published figures are of 8-bit images; `image_scores` does this itself, the single metrics don't.
+    Published figures are of 8-bit images; the metrics of this module don't do this themselves.
 
     Args:
         image: any shape.
@@ -51,35 +48,6 @@ def quantise(image: torch.Tensor) -> torch.Tensor:
         The same shape; its gradient is zero.
     """
     return (image.clamp(0, 1) * 255).round() / 255
-
-
-def image_scores(
-    prediction: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None
-) -> dict[str, torch.Tensor]:
-    """PSNR, SSIM and MS-SSIM of two images, both quantised to 8 bit first.
-
-    Args:
-        prediction: [B, 3, H, W], RGB; [0, 1] after clamping.
-        target: [B, 3, H, W], RGB, likewise.
-        mask: [B, 1, H, W], 1 where both cameras see the scene; adds the scores of that region alone.
-
-    Returns:
-        "psnr", "ssim", "ms_ssim" and, with a mask, "psnr_masked" and "ssim_masked"; [B] each.
-
-    Raises:
-        ValueError: shapes don't fit, or a side is below MS_SSIM_SIDE.
-
-    Source: SPEC section 10.
-    """
-    prediction, target = quantise(prediction), quantise(target)
-    scores = {
-        "psnr": psnr(prediction, target),
-        "ssim": ssim(prediction, target),
-        "ms_ssim": ms_ssim(prediction, target),
-    }
-    if mask is not None:
-        scores |= {"psnr_masked": psnr(prediction, target, mask), "ssim_masked": ssim(prediction, target, mask)}
-    return scores
 
 
 def psnr(prediction: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
@@ -105,8 +73,6 @@ def ssim(
     prediction: torch.Tensor,
     target: torch.Tensor,
     mask: torch.Tensor | None = None,
-    windows: Windows = "all",
-    sample_covariance: bool = False,
 ) -> torch.Tensor:
     """Mean over windows and channels of (2 mx my + C1) (2 sxy + C2) / ((mx^2 + my^2 + C1) (sxx + syy + C2)).
 
@@ -117,17 +83,14 @@ def ssim(
     Args:
         prediction: [B, 3, H, W] in [0, 1], RGB; H and W are WINDOW or more.
         target: [B, 3, H, W] in [0, 1], RGB.
-        mask: [B, 1, H, W], bool or numbers: inside where above 0.5. None is everything.
-        windows: with a mask, the windows that count. "all": every pixel of the window is inside, so nothing outside
-            has an influence, and a rectangle scores as its crop does. "centre": the middle pixel is inside; for masks
-            too thin to hold a window.
-        sample_covariance: scikit-image's own default, covariances times N / (N - 1) with N = 121.
+        mask: [B, 1, H, W], bool or numbers: inside where above 0.5. None is everything. Windows with every pixel inside
+            count, so nothing outside has an influence, and a rectangle scores as its crop does.
 
     Returns:
         [B], 1 for equal images; NaN where no window is inside. Differentiable in both images.
 
     Raises:
-        ValueError: shapes don't fit, the image is smaller than a window, or ``windows`` is neither word.
+        ValueError: shapes don't fit, the image is smaller than a window.
 
     Source: Wang, Bovik, Sheikh, Simoncelli: Image Quality Assessment: From Error Visibility to Structural
     Similarity, 2004.
@@ -135,11 +98,11 @@ def ssim(
     sizes = check(prediction=(prediction, "B 3 H W"), target=(target, "B 3 H W"))
     _require_side(sizes, WINDOW, "a window of SSIM")
     inside = _inside(mask, sizes, prediction)
-    if windows == "all":  # a NaN that can't be seen must not spread through the matrix products
-        prediction, target = (torch.where(inside, image, 0) for image in (prediction, target))
-    luminance, structure = _ssim_maps(prediction, target, sample_covariance)
+    # A NaN that can't be seen must not spread through the matrix products.
+    prediction, target = (torch.where(inside, image, 0) for image in (prediction, target))
+    luminance, structure = _ssim_maps(prediction, target)
     values = (luminance * structure).mean(dim=1, keepdim=True)
-    return _mean_inside(values, _windows_inside(inside, windows))
+    return _mean_inside(values, functional.max_pool2d((~inside).float(), WINDOW, stride=1) == 0)
 
 
 def ms_ssim(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -167,7 +130,7 @@ def ms_ssim(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     for level, weight in enumerate(LEVEL_WEIGHTS):
         if level:
             prediction, target = functional.avg_pool2d(prediction, 2), functional.avg_pool2d(target, 2)
-        luminance, structure = _ssim_maps(prediction, target, sample_covariance=False)
+        luminance, structure = _ssim_maps(prediction, target)
         is_last = level == len(LEVEL_WEIGHTS) - 1
         factor = (luminance * structure if is_last else structure).mean(dim=(2, 3))
         score = score * factor.clamp(min=0) ** weight
@@ -235,17 +198,13 @@ def end_point_error(
     return _mean_inside(errors, torch.ones_like(errors, dtype=torch.bool) if mask is None else mask > 0.5)
 
 
-def _ssim_maps(
-    prediction: torch.Tensor, target: torch.Tensor, sample_covariance: bool
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _ssim_maps(prediction: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """SSIM's two factors, luminance and contrast-structure, [B, C, H - 10, W - 10] each."""
-    pixels = WINDOW * WINDOW
-    unbias = pixels / (pixels - 1) if sample_covariance else 1.0
     products = [prediction, target, prediction.square() + target.square(), prediction * target]
     mean_x, mean_y, squares, cross = _gaussian(torch.stack(products)).unbind()
     mean_squares, mean_cross = mean_x.square() + mean_y.square(), mean_x * mean_y
     luminance = (2 * mean_cross + C1) / (mean_squares + C1)
-    structure = (2 * unbias * (cross - mean_cross) + C2) / (unbias * (squares - mean_squares) + C2)
+    structure = (2 * (cross - mean_cross) + C2) / (squares - mean_squares + C2)
     return luminance, structure
 
 
@@ -277,16 +236,6 @@ def _inside(mask: torch.Tensor | None, sizes: dict[str, int], like: torch.Tensor
         return torch.ones(shape, dtype=torch.bool, device=like.device)
     check(mask=(mask.to(like.dtype), " ".join(map(str, shape))))
     return mask > 0.5
-
-
-def _windows_inside(inside: torch.Tensor, windows: str) -> torch.Tensor:
-    """bool [B, 1, H, W] of pixels -> [B, 1, H - 10, W - 10] of windows."""
-    if windows == "centre":
-        border = WINDOW // 2
-        return inside[..., border:-border, border:-border]
-    if windows == "all":
-        return functional.max_pool2d((~inside).float(), WINDOW, stride=1) == 0
-    raise ValueError(f'`windows` must be "all" or "centre", got {windows!r}')
 
 
 def _mean_inside(values: torch.Tensor, inside: torch.Tensor) -> torch.Tensor:

@@ -87,11 +87,6 @@ class PreparedClip:
         """Whether frames t + 1 ... t + steps follow frame t = ``index`` without a gap: they are each other's next."""
         return times.frames_after(self.positions, index, steps) == list(range(index + 1, index + steps + 1))
 
-    @property
-    def has_right(self) -> bool:
-        """Whether every frame has a right camera."""
-        return all(frame.right is not None for frame in self.frames)
-
     def frame_name(self, index: int) -> str:
         """The frame's name in its clip, "0000000012"."""
         return self._frame(index).name

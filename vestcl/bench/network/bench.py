@@ -16,12 +16,13 @@ from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.options import DeviceOptions
 from vestcl.bench.common.table import Measurement, Section, busy, show_grid, verdict
 from vestcl.bench.common.timing import Spread
+from vestcl.clock import Clock
 from vestcl.data import Frame, Street, intrinsics
 from vestcl.data.street.raycast import STREET_SKY_DEPTH
 from vestcl.io.labels import background
 from vestcl.models import ModelConfig, configuration
 from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference.stage_times import Stopwatch, watching
+from vestcl.models.inference.stage_times import watching
 from vestcl.models.steps.prior import MotionPrior, nothing_moves
 from vestcl.scene import layers
 from vestcl.scene.layers import LayerBatch
@@ -135,7 +136,7 @@ def _parts(
     def several(tensor: torch.Tensor) -> torch.Tensor:
         return tensor.repeat(config.batch, *(1,) * (tensor.ndim - 1))
 
-    def forecast(watch: Stopwatch) -> None:
+    def forecast(watch: Clock) -> None:
         with watch.time("inpaint"):
             pair = [street_layers(frame) for frame in frames[:2]]
         with torch.no_grad(), watch.time("forward"):
@@ -148,7 +149,7 @@ def _parts(
         truth, cameras = several(torch.from_numpy(frames[2].colour)), several(K)
         adam = torch.optim.Adam(model.train().parameters(), LEARNING_RATE)
 
-        def train(watch: Stopwatch) -> None:
+        def train(watch: Clock) -> None:
             session, busy = opencl.current(), opencl.current().seconds
             with watch.time("training step"):
                 adam.zero_grad(set_to_none=True)
@@ -165,11 +166,11 @@ def _parts(
         yield show(config, console, _measure(title, train, "training step", config.runs))
 
 
-def _measure(title: str, task: Callable[[Stopwatch], None], whole: str, runs: int) -> dict[str, Any]:
+def _measure(title: str, task: Callable[[Clock], None], whole: str, runs: int) -> dict[str, Any]:
     """A forecast or a training step, its stages first and the whole last; memory is the most that was taken so far."""
     watches = []
     for _ in range(WARM_UP):
-        task(Stopwatch())
+        task(Clock())
     with _timing.watching_others() as others:
         for _ in range(runs):
             with watching() as watch:

@@ -160,6 +160,8 @@ def perceived(clip: Clip, driven: Driven) -> Clip:
 
 
 def _seen(sample: Sample, index: int, driven: Driven, beams: int) -> Sample:
+    if driven.depth is None and driven.masks is None:
+        return sample
     assert isinstance(sample.depth, StreetDepth)
     shot = sample.depth.shot
     if driven.depth in ("stereo", "motion"):

@@ -26,7 +26,7 @@ from vestcl.models.networks.object_motion import (
 )
 from vestcl.models.weights_file import unwrapped
 
-__all__ = ["FastForecaster", "Precision", "accelerate", "computes_bfloat16", "keep_freed_memory", "share_frames"]
+__all__ = ["FastForecaster", "Precision", "accelerate", "computes_bfloat16", "share_frames"]
 
 Precision = Literal["float32", "bfloat16"]
 

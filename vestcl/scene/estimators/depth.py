@@ -10,12 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
 from torch import nn
 from torch.nn import functional
 
 from vestcl.scene.estimators._checkpoint import Checkpoint
-from vestcl.scene.estimators._preparation import Preparation, one_picture, pictures
+from vestcl.scene.estimators._estimator import Estimator, check_finite
+from vestcl.scene.estimators._preparation import Preparation
 
 #: ZoeDepth's head for streets.
 DOMAIN: Final = "kitti"
@@ -47,14 +47,13 @@ class _AlwaysVotes(nn.Module):
 
 
 @dataclass(frozen=True, eq=False)
-class DepthEstimator:
+class DepthEstimator(Estimator[np.float32]):
     """Depth of a picture, metres; `load` makes one.
 
     The same picture always gives the same bits on the same machine with the same number of threads.
     """
 
     model: Any
-    """transformers' network."""
     preparation: Preparation
     domain: int | None
     """Which of several heads of ZoeDepth measures; None where there is but one."""
@@ -103,48 +102,18 @@ class DepthEstimator:
             model.metric_head.mlp_classifier = _AlwaysVotes(domain, count).to(device)
         return cls(model, preparation, domain, zoe if flip is None else flip, device)
 
-    def __call__(self, image: ArrayLike) -> NDArray[np.float32]:
-        """Depth of one picture.
-
-        Args:
-            image: [3, H, W] RGB in [0, 1].
-
-        Returns:
-            [1, H, W] m, finite, NEAREST or more.
-
-        Raises:
-            ValueError: another shape, or numbers outside [0, 1].
-        """
-        return self.batch(one_picture(image))[0]
-
-    @torch.inference_mode()
-    def batch(self, images: ArrayLike) -> NDArray[np.float32]:
-        """Depth of several pictures of one size, at once.
-
-        Args:
-            images: [B, 3, H, W] RGB in [0, 1].
-
-        Returns:
-            [B, 1, H, W] m, finite, NEAREST or more; up to rounding what each gives alone.
-
-        Raises:
-            ValueError: another shape, numbers outside [0, 1], or a checkpoint that answers with NaN.
-        """
-        values = torch.from_numpy(pictures(images))
-        height, width = values.shape[-2:]
-        seen = self.preparation(values.to(self.device))
-        depth = self._estimate(seen)
+    def _estimate(self, seen: torch.Tensor, height: int, width: int) -> torch.Tensor:
+        depth = self._measure(seen)
         if self.flip:
-            depth = (depth + self._estimate(seen.flip(-1)).flip(-1)) / 2
+            depth = (depth + self._measure(seen.flip(-1)).flip(-1)) / 2
         rows, columns = self.preparation.padding(height, width)
         padded = (height + 2 * rows, width + 2 * columns)
         depth = functional.interpolate(depth, padded, mode="bicubic", align_corners=False)
         depth = depth[..., rows : rows + height, columns : columns + width].clamp(min=NEAREST)
-        if not torch.isfinite(depth).all():
-            raise ValueError("the checkpoint must give finite depths, got NaN or infinity: its weights are damaged")
-        return depth.contiguous().cpu().numpy()
+        check_finite(depth, "depths")
+        return depth.contiguous()
 
-    def _estimate(self, seen: torch.Tensor) -> torch.Tensor:
+    def _measure(self, seen: torch.Tensor) -> torch.Tensor:
         output = self.model(pixel_values=seen)
         if self.domain is not None and int(output.domain_logits.sum(0).argmax()) != self.domain:
             # Those are the votes that the network itself has counted, wherever a version of transformers takes them.

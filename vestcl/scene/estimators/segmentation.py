@@ -6,11 +6,11 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
 from torch.nn import functional
 
 from vestcl.scene.estimators._checkpoint import Checkpoint
-from vestcl.scene.estimators._preparation import Preparation, one_picture, pictures
+from vestcl.scene.estimators._estimator import Estimator, check_finite
+from vestcl.scene.estimators._preparation import Preparation
 
 #: Cityscapes' classes by train id.
 CLASSES: Final = (
@@ -25,11 +25,10 @@ _NETWORKS: Final = {
 
 
 @dataclass(frozen=True, eq=False)
-class SegmentationEstimator:
+class SegmentationEstimator(Estimator[np.uint8]):
     """Train ids of a picture; `load` makes one. `vestcl.io.labels.background` makes the mask M of them."""
 
     model: Any
-    """transformers' network."""
     preparation: Preparation
     device: str
 
@@ -66,41 +65,13 @@ class SegmentationEstimator:
         preparation = Preparation.read(checkpoint.name, checkpoint.preparation, zoe=False, size=size)
         return cls(checkpoint.load(device), preparation, device)
 
-    def __call__(self, image: ArrayLike) -> NDArray[np.uint8]:
-        """Classes of one picture.
-
-        Args:
-            image: [3, H, W] RGB in [0, 1].
-
-        Returns:
-            [1, H, W] train ids, 0 to 18: a network knows no void.
-
-        Raises:
-            ValueError: another shape, or numbers outside [0, 1].
-        """
-        return self.batch(one_picture(image))[0]
-
-    @torch.inference_mode()
-    def batch(self, images: ArrayLike) -> NDArray[np.uint8]:
-        """argmax_c of the class scores, which are brought to the picture's size bilinearly.
-
-        Args:
-            images: [B, 3, H, W] RGB in [0, 1].
-
-        Returns:
-            [B, 1, H, W] train ids, 0 to 18.
-
-        Raises:
-            ValueError: another shape, numbers outside [0, 1], or a checkpoint that answers with NaN.
-        """
-        values = torch.from_numpy(pictures(images))
-        seen = self.preparation(values.to(self.device))
+    def _estimate(self, seen: torch.Tensor, height: int, width: int) -> torch.Tensor:
+        """argmax_c of the class scores, which are brought to the image's size bilinearly."""
         output = self.model(pixel_values=seen)
         scores = output.logits if hasattr(output, "logits") else _of_queries(output, seen.shape[-2], seen.shape[-1])
-        if not torch.isfinite(scores).all():
-            raise ValueError("the checkpoint must give finite scores, got NaN or infinity: its weights are damaged")
-        scores = functional.interpolate(scores, values.shape[-2:], mode="bilinear", align_corners=False)
-        return scores.argmax(1, keepdim=True).to(torch.uint8).cpu().numpy()
+        check_finite(scores, "scores")
+        scores = functional.interpolate(scores, (height, width), mode="bilinear", align_corners=False)
+        return scores.argmax(1, keepdim=True).to(torch.uint8)
 
 
 def _of_queries(output: Any, height: int, width: int) -> torch.Tensor:
