@@ -6,27 +6,23 @@ that `train.evaluate --peer` and `vestcl bench forecast --peer` read, ``log.json
 """
 
 import dataclasses
-import json
-import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, cast
 
 import torch
 import tyro
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 from rich.console import Console
-from torch import nn
 from torch.nn import functional
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from train.data.windows import Batch, loader
 from train.fit import window_set
+from train.run.loop import Loop, RunOptions, check_new
 from train.run.losses import Perceptual, build_perceptual, image_terms
-from train.run.trainer import learning_rate_factor
 from train.settings.config import (
     RULES,
     CountOrNone,
@@ -35,16 +31,14 @@ from train.settings.config import (
     OptimiserConfig,
     RunConfig,
     Stage,
+    StageParts,
     with_stage_parts,
 )
-from train.settings.yaml_files import in_words, read_settings
-from vestcl.io import atomic
+from train.settings.yaml_files import checked, read_settings
 from vestcl.models.networks.voxel_flow import MULTIPLE, VoxelFlowNetwork
 
-#: Files of a run.
+#: What a run is for.
 WEIGHTS: Final = "peer.safetensors"
-STATE: Final = "state.pt"
-LOG: Final = "log.jsonl"
 
 #: Levels of the Laplacian pyramid, and what an earlier block's image counts against the next one's: DMVFN's.
 LEVELS: Final = 5
@@ -52,7 +46,7 @@ DISCOUNT: Final = 0.8
 
 
 @dataclass(frozen=True, config=RULES)
-class PeerConfig:
+class PeerConfig(StageParts):
     """A run of the peer.
 
     Of `Stage`, ``train`` and ``render`` have no meaning here, and of `RunConfig` ``keep`` and ``image_every``.
@@ -80,15 +74,6 @@ class PeerConfig:
             if data.crop is not None and any(side % MULTIPLE for side in data.crop):
                 raise ValueError(f"`crop` must be multiples of {MULTIPLE} px, got {list(data.crop)}")
 
-    def data_of(self, stage: Stage) -> DataConfig:
-        """What ``stage`` is shown."""
-        data = stage.data or self.data
-        return data if stage.crop is None else dataclasses.replace(data, crop=stage.crop)
-
-    def loss_of(self, stage: Stage) -> LossConfig:
-        """What ``stage`` minimises."""
-        return stage.loss or self.loss
-
 
 def load_config(path: Path | str, overrides: Sequence[str] = ()) -> PeerConfig:
     """As `train.settings.config.load_config`, for the peer.
@@ -97,10 +82,7 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> PeerConfig:
         FileNotFoundError: no such file.
         ValueError: everything that is wrong, in one message.
     """
-    try:
-        return _ADAPTER.validate_python(with_stage_parts(read_settings(path, overrides)))
-    except ValidationError as error:
-        raise ValueError(in_words(error, PeerConfig, str(path))) from error
+    return checked(PeerConfig, with_stage_parts(read_settings(path, overrides)), str(path))
 
 
 # ---------------------------------------------------------------- loss
@@ -150,17 +132,18 @@ def loss_of(
 # ---------------------------------------------------------------- run
 
 
-class PeerTraining:
+class PeerTraining(Loop):
     """The network, its EMA weights and what is known of the run, through all stages."""
+
+    name = "network"
+    network: VoxelFlowNetwork
 
     def __init__(self, config: PeerConfig, network: VoxelFlowNetwork | None = None) -> None:
         torch.manual_seed(config.seed)
-        self.config, self.console = config, Console()
-        self.network = (network or VoxelFlowNetwork()).train()
-        self.network.router.requires_grad_(False)
-        self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.optimiser.ema))
-        self.number, self.done, self.step = 0, 0, 0
-        self.restored: dict[str, Any] | None = None
+        network = (network or VoxelFlowNetwork()).train()
+        network.router.requires_grad_(False)
+        super().__init__(config.out, network, config.optimiser, config.run)
+        self.config, self.number, self.done = config, 0, 0
 
     @property
     def ema(self) -> VoxelFlowNetwork:
@@ -175,80 +158,43 @@ class PeerTraining:
         """
         while self.number < len(self.config.stages):
             self._stage(self.config.stages[self.number])
-            self.number, self.done, self.restored = self.number + 1, 0, None
+            self.number, self.done = self.number + 1, 0
 
-    def restore(self) -> None:
-        """Resume from the run's last state, if there is one."""
-        path = self.config.out / STATE
-        if path.is_file():
-            state = torch.load(path, weights_only=True)
-            self.network.load_state_dict(state["network"])
-            self.average.load_state_dict(state["average"])
-            self.number, self.done, self.step = state["number"], state["done"], state["step"]
-            self.restored = state["adam"]
+    def place(self) -> dict[str, int]:
+        """Where the run is."""
+        return {"number": self.number, "done": self.done, "step": self.step}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Resume from the content of the run's state."""
+        super().restore(state)
+        self.number, self.done = state["number"], state["done"]
+
+    def save_weights(self) -> None:
+        """Write the EMA weights."""
+        self.ema.save(self.out / WEIGHTS)
 
     def _stage(self, stage: Stage) -> None:
-        config, data, loss = self.config, self.config.data_of(stage), self.config.loss_of(stage)
-        perceptual, learning = build_perceptual(loss), [p for p in self.network.parameters() if p.requires_grad]
-        decay = config.optimiser.weight_decay
-        adam = torch.optim.AdamW(learning, stage.learning_rate, config.optimiser.betas, weight_decay=decay)
-        if self.restored is not None:
-            adam.load_state_dict(self.restored)
+        data, loss, run = self.config.data_of(stage), self.config.loss_of(stage), self.config.run
+        perceptual = build_perceptual(loss)
+        self.begin(stage)
         steps = range(self.done, stage.steps)
         waiting = time.perf_counter()
-        for batch in loader(window_set(data), config.seed + self.number, stage.batch, steps, workers=data.workers):
+        for batch in loader(window_set(data), self.config.seed + self.number, stage.batch, steps, workers=data.workers):
             waited, start = time.perf_counter() - waiting, time.perf_counter()
-            rate = stage.learning_rate * learning_rate_factor(self.done, stage, config.optimiser.final_factor)
-            adam.param_groups[0]["lr"] = rate
-            adam.zero_grad(set_to_none=True)
             total, terms = loss_of(self.network, batch, loss, perceptual)
-            total.backward()
-            norm = nn.utils.clip_grad_norm_(learning, config.optimiser.clip_norm or math.inf)
-            if math.isfinite(total.item()) and math.isfinite(norm.item()):
-                adam.step()
-                self.average.update_parameters(self.network)
-            elif config.run.on_nan == "stop":
-                raise ValueError(f"step {self.step + 1}: non-finite loss or gradient with {', '.join(batch.clips)}")
-            self.done, self.step = self.done + 1, self.step + 1
-            row = {
-                "loss": total.item(),
-                **{name: term.item() for name, term in terms.items()},
-                "gradient": norm.item(),
-            }
-            self._log(stage, row | {"rate": rate, "s_data": waited, "s_network": time.perf_counter() - start})
-            if self.step % config.run.checkpoint_every == 0 or self.done == stage.steps:
-                self._save(adam)
+            row = self.update(total, terms, stage, self.done, batch.clips)
+            self.done += 1
+            row |= {"s_data": waited, "s_network": time.perf_counter() - start}
+            if self.step % run.log_every == 0 or self.done == stage.steps:
+                self.log(row, stage=stage.name)
+            if self.step % run.checkpoint_every == 0 or self.done == stage.steps:
+                self.save()
             waiting = time.perf_counter()
-
-    def _log(self, stage: Stage, row: dict[str, float]) -> None:
-        if self.step % self.config.run.log_every == 0 or self.done == stage.steps:
-            with (self.config.out / LOG).open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"step": self.step, "stage": stage.name, **row}) + "\n")
-            shown = ", ".join(f"{name} {value:.4g}" for name, value in row.items())
-            self.console.print(f"step {self.step}, {stage.name}: {shown}", highlight=False, soft_wrap=True)
-
-    def _save(self, adam: torch.optim.Optimizer) -> None:
-        self.ema.save(self.config.out / WEIGHTS)
-        state = {"network": self.network.state_dict(), "average": self.average.state_dict(), "adam": adam.state_dict()}
-        with atomic.replacing(self.config.out / STATE) as temporary:
-            torch.save(state | {"number": self.number, "done": self.done, "step": self.step}, temporary)
-
-
-@dataclasses.dataclass(frozen=True)
-class PeerOptions:
-    """Train the learned 2D peer as a configuration says."""
-
-    config: tyro.conf.Positional[Path]
-    """YAML file."""
-    overrides: tyro.conf.Positional[tuple[str, ...]] = ()
-    """key=value or key.sub=value each; values are YAML."""
-    resume: bool = False
-    """Resume the run from its last state, if it has one."""
 
 
 def main(arguments: list[str] | None = None) -> int:
     """The command; its exit status."""
-    options = tyro.cli(PeerOptions, args=arguments, description=__doc__, prog="python -m train.peer")
+    options = tyro.cli(RunOptions, args=arguments, description=__doc__, prog="python -m train.peer")
     try:
         train(load_config(options.config, options.overrides), resume=options.resume)
     except (ValueError, OSError) as error:
@@ -272,19 +218,11 @@ def train(config: PeerConfig, *, resume: bool = False, network: VoxelFlowNetwork
         ValueError: data or weights that can't be used, a run that exists already, or a non-finite loss.
         FileNotFoundError: no classifier's weights for the perceptual loss.
     """
-    if not resume and (config.out / STATE).exists():
-        raise ValueError(f"`out` {config.out} has a run already: --resume resumes it, or take another folder")
-    config.out.mkdir(parents=True, exist_ok=True)
-    if config.run.threads:
-        torch.set_num_threads(config.run.threads)
+    check_new(config.out, resume)
     training = PeerTraining(config, network)
-    if resume:
-        training.restore()
-    training.go()
+    training.train(resume)
     return training.ema.eval()
 
-
-_ADAPTER: Final = TypeAdapter(PeerConfig)
 
 if __name__ == "__main__":
     sys.exit(main())

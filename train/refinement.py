@@ -6,8 +6,6 @@ It learns on what `train.forecasts` kept, which is what it sees at inference, an
 """
 
 import dataclasses
-import json
-import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -17,31 +15,26 @@ from typing import Annotated, Any, Final, cast
 import numpy as np
 import torch
 import tyro
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 from rich.console import Console
-from torch import nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from train.command import ERRORS, failed
 from train.data.augment import draw_colour, mean_luma
 from train.forecasts import unpack
+from train.run.loop import Loop, RunOptions, check_new
 from train.run.losses import Perceptual, build_perceptual, image_terms
-from train.run.trainer import learning_rate_factor
 from train.settings.config import RULES, Count, CountOrNone, LossConfig, OptimiserConfig, RunConfig, Share, Stage
-from train.settings.yaml_files import in_words, read_settings
+from train.settings.yaml_files import checked, read_settings
 from vestcl import interrupt
-from vestcl.io import atomic
 from vestcl.models.checkpoint import read_trained_on, write_checkpoint
 from vestcl.models.config import ModelConfig, RefineConfig
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.refine import Refine
 from vestcl.models.shipped import find_model
 
-#: Files of a run.
+#: What a run is for.
 WEIGHTS: Final = "vest.safetensors"
-STATE: Final = "state.pt"
-LOG: Final = "log.jsonl"
 
 #: Luma of RGB (ITU-R BT.601).
 _LUMA: Final = np.array([0.299, 0.587, 0.114], np.float32)
@@ -95,10 +88,7 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> RefinementCo
         FileNotFoundError: no such file.
         ValueError: everything that is wrong, in one message.
     """
-    try:
-        return _ADAPTER.validate_python(read_settings(path, overrides))
-    except ValidationError as error:
-        raise ValueError(in_words(error, RefinementConfig, str(path))) from error
+    return checked(RefinementConfig, read_settings(path, overrides), str(path))
 
 
 # ---------------------------------------------------------------- data
@@ -204,25 +194,22 @@ def with_forecast_refinement(model: Forecaster, name: str) -> Forecaster:
 # ---------------------------------------------------------------- run
 
 
-class RefinementTraining:
+class RefinementTraining(Loop):
     """The refinement, its EMA weights and what is known of the run."""
+
+    name = "refine"
+    network: Refine
 
     def __init__(self, config: RefinementConfig, base: Forecaster) -> None:
         torch.manual_seed(config.seed)
-        self.config, self.console = config, Console()
-        self.whole = with_forecast_refinement(base, config.name)
+        self.config, self.whole = config, with_forecast_refinement(base, config.name)
         if config.init is not None:
             self._start_from(config.init)
-        self.refine: Refine = self.whole.refine.train()
-        self.average = AveragedModel(self.refine, multi_avg_fn=get_ema_multi_avg_fn(config.optimiser.ema))
+        super().__init__(config.out, self.whole.refine.train(), config.optimiser, config.run)
         self.samples = Samples(config.data, config.seed)
         shown = [read_trained_on(find_model(name)) or {} for name in (config.model, config.init or config.model)]
         self.trained_on = _joined(*shown, self.samples.shown())
         self.perceptual: Perceptual | None = build_perceptual(config.loss)
-        decay, stage = config.optimiser.weight_decay, config.stage
-        betas, learning = config.optimiser.betas, self.refine.parameters()
-        self.adam = torch.optim.AdamW(learning, stage.learning_rate, betas, weight_decay=decay)
-        self.step = 0
 
     def _start_from(self, name: str) -> None:
         given = Forecaster.from_pretrained(name)
@@ -233,16 +220,6 @@ class RefinementTraining:
         except RuntimeError as error:
             raise ValueError(f"`init` must have a refinement of forecasts that fits, got {name} ({error})") from error
 
-    def restore(self) -> None:
-        """Resume from the run's last state, if there is one."""
-        path = self.config.out / STATE
-        if path.is_file():
-            state = torch.load(path, weights_only=True)
-            self.refine.load_state_dict(state["refine"])
-            self.average.load_state_dict(state["average"])
-            self.adam.load_state_dict(state["adam"])
-            self.step = state["step"]
-
     def go(self) -> None:
         """To the last step.
 
@@ -250,36 +227,21 @@ class RefinementTraining:
             ValueError: data that can't be used, or a loss that is not finite.
         """
         stage, run = self.config.stage, self.config.run
+        self.begin(stage)
         for step in range(self.step, stage.steps):
             start = time.perf_counter()
             planes, target = self.samples.batch(step, stage.batch)
             read = time.perf_counter() - start
-            row = self._update(planes, target)
-            self.step = step + 1
+            with torch.autocast("cpu", torch.bfloat16, enabled=run.precision == "bfloat16"):
+                image = self.network(planes)
+            terms = image_terms(image.float(), target, self.config.loss, self.perceptual)
+            total = torch.stack([weight * term for weight, term in terms.values()]).sum()
+            row = self.update(total, {name: term for name, (_, term) in terms.items()}, stage, step)
             row |= {"s_data": read, "s_network": time.perf_counter() - start - read}
             if self.step % run.log_every == 0 or self.step == stage.steps:
-                self._log(row | self._geometric(planes, target))
+                self.log(row | self._geometric(planes, target))
             if self.step % run.checkpoint_every == 0 or self.step == stage.steps:
-                self._save()
-
-    def _update(self, planes: torch.Tensor, target: torch.Tensor) -> dict[str, float]:
-        config, stage = self.config, self.config.stage
-        rate = stage.learning_rate * learning_rate_factor(self.step, stage, config.optimiser.final_factor)
-        self.adam.param_groups[0]["lr"] = rate
-        self.adam.zero_grad(set_to_none=True)
-        with torch.autocast("cpu", torch.bfloat16, enabled=config.run.precision == "bfloat16"):
-            image = self.refine(planes)
-        terms = image_terms(image.float(), target, config.loss, self.perceptual)
-        total = torch.stack([weight * term for weight, term in terms.values()]).sum()
-        total.backward()
-        norm = nn.utils.clip_grad_norm_(self.refine.parameters(), config.optimiser.clip_norm or math.inf)
-        if math.isfinite(total.item()) and math.isfinite(norm.item()):
-            self.adam.step()
-            self.average.update_parameters(self.refine)
-        elif config.run.on_nan == "stop":
-            raise ValueError(f"step {self.step + 1}: non-finite loss or gradient")
-        each = {name: term.item() for name, (_, term) in terms.items()}
-        return {"loss": total.item(), **each, "gradient": norm.item(), "rate": rate}
+                self.save()
 
     def _geometric(self, planes: torch.Tensor, target: torch.Tensor) -> dict[str, float]:
         """The terms of the forecasts as they are."""
@@ -287,23 +249,15 @@ class RefinementTraining:
             terms = image_terms(planes[:, :3], target, self.config.loss, self.perceptual)
         return {f"{name}_geometric": term.item() for name, (_, term) in terms.items()}
 
-    def _log(self, row: Mapping[str, float]) -> None:
-        with (self.config.out / LOG).open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"step": self.step, **row}) + "\n")
-        shown = ", ".join(f"{name} {value:.4g}" for name, value in row.items())
-        self.console.print(f"step {self.step}: {shown}", highlight=False, soft_wrap=True)
-
     def model(self) -> tuple[ModelConfig, dict[str, torch.Tensor]]:
         """The whole model with the EMA weights."""
         mean = cast(Refine, self.average.module).state_dict()
         state = dict(self.whole.state_dict()) | {f"refine.{name}": value for name, value in mean.items()}
         return self.whole.config, state
 
-    def _save(self) -> None:
-        write_checkpoint(self.config.out / WEIGHTS, *self.model(), self.trained_on)
-        state = {"refine": self.refine.state_dict(), "average": self.average.state_dict()}
-        with atomic.replacing(self.config.out / STATE) as temporary:
-            torch.save(state | {"adam": self.adam.state_dict(), "step": self.step}, temporary)
+    def save_weights(self) -> None:
+        """Write the whole model."""
+        write_checkpoint(self.out / WEIGHTS, *self.model(), self.trained_on)
 
 
 def _joined(*shown: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
@@ -330,34 +284,15 @@ def train(config: RefinementConfig, *, resume: bool = False, base: Forecaster | 
         ValueError: data or weights that can't be used, a run that exists already, or a non-finite loss.
         FileNotFoundError: no classifier's weights for the perceptual loss.
     """
-    if not resume and (config.out / STATE).exists():
-        raise ValueError(f"`out` {config.out} has a run already: --resume resumes it, or take another folder")
-    if config.run.threads:
-        torch.set_num_threads(config.run.threads)
-    training = RefinementTraining(config, base or Forecaster.from_pretrained(config.model))
-    config.out.mkdir(parents=True, exist_ok=True)
-    if resume:
-        training.restore()
-    training.go()
+    check_new(config.out, resume)
+    RefinementTraining(config, base or Forecaster.from_pretrained(config.model)).train(resume)
     return config.out / WEIGHTS
-
-
-@dataclasses.dataclass(frozen=True)
-class RefinementOptions:
-    """Train the refinement of geometric forecasts as a configuration says."""
-
-    config: tyro.conf.Positional[Path]
-    """YAML file."""
-    overrides: tyro.conf.Positional[tuple[str, ...]] = ()
-    """key=value or key.sub=value each; values are YAML."""
-    resume: bool = False
-    """Resume the run from its last state, if it has one."""
 
 
 @interrupt.command
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; its exit status."""
-    options = tyro.cli(RefinementOptions, args=arguments, description=__doc__, prog="python -m train.refinement")
+    options = tyro.cli(RunOptions, args=arguments, description=__doc__, prog="python -m train.refinement")
     try:
         file = train(load_config(options.config, options.overrides), resume=options.resume)
     except ERRORS as error:
@@ -365,8 +300,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Console().print(str(file), highlight=False, markup=False, soft_wrap=True)
     return 0
 
-
-_ADAPTER: Final = TypeAdapter(RefinementConfig)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -13,7 +13,8 @@ from train_scenes import street
 from train import peer
 from train.data.windows import Batch
 from train.fit import window_set
-from train.peer import LOG, STATE, WEIGHTS, PeerConfig, load_config, loss_of, pyramid_loss, train
+from train.peer import WEIGHTS, PeerConfig, load_config, loss_of, pyramid_loss, train
+from train.run.loop import LOG, STATE
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 
 SETTINGS: dict[str, Any] = {

@@ -13,8 +13,9 @@ from forecaster_scenes import SMALL
 
 from train import forecasts, refinement, refinement_scores
 from train.forecasts import Entry, ForecastWindow, pack, unpack
-from train.refinement import LOG, STATE, RefinementConfig, Samples, load_config, train, with_forecast_refinement
+from train.refinement import RefinementConfig, Samples, load_config, train, with_forecast_refinement
 from train.run import trainer
+from train.run.loop import LOG, STATE
 from vestcl.cli.prepare import open_input
 from vestcl.data import Street, street_clip
 from vestcl.forecasting.geometric import Perception, forecast_frames

@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
-from pydantic import ConfigDict, Field, Strict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, Strict, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from train.settings.yaml_files import in_words, merged, read_settings
+from train.settings.yaml_files import checked, merged, read_settings
 from vestcl.models import configuration
 
 Part = Literal["encoder", "ego_motion", "object_motion", "refine"]
@@ -214,8 +214,24 @@ class Position(NamedTuple):
     """Steps of that stage that are done."""
 
 
+class StageParts:
+    """What stages say of their own; elsewhere the run's counts."""
+
+    data: DataConfig
+    loss: LossConfig
+
+    def data_of(self, stage: Stage) -> DataConfig:
+        """What ``stage`` is shown: its own data or else the run's, with its own crop or else theirs."""
+        data = stage.data or self.data
+        return data if stage.crop is None else dataclasses.replace(data, crop=stage.crop)
+
+    def loss_of(self, stage: Stage) -> LossConfig:
+        """What ``stage`` minimises: its own loss or else the run's."""
+        return stage.loss or self.loss
+
+
 @dataclass(frozen=True, config=RULES)
-class Config:
+class Config(StageParts):
     """A run."""
 
     name: Annotated[str, Field(min_length=1)]
@@ -269,15 +285,6 @@ class Config:
             index += 1
         return Position(index, self.stages[index], step)
 
-    def data_of(self, stage: Stage) -> DataConfig:
-        """What ``stage`` is shown: its own data or else the run's, with its own crop or else theirs."""
-        data = stage.data or self.data
-        return data if stage.crop is None else dataclasses.replace(data, crop=stage.crop)
-
-    def loss_of(self, stage: Stage) -> LossConfig:
-        """What ``stage`` minimises: its own loss or else the run's."""
-        return stage.loss or self.loss
-
 
 def load_config(path: Path | str, overrides: Sequence[str] = ()) -> Config:
     """A configuration from a YAML file, the files that it builds on, and what the command line changes.
@@ -298,7 +305,8 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> Config:
         ValueError: everything that is wrong, in one message: keys that are unknown, with the nearest that is known;
             values out of range or of another kind; what the file leaves open and no override sets.
     """
-    return _checked(read_settings(path, overrides), f"{path}{' with ' if overrides else ''}{' '.join(overrides)}")
+    source = f"{path}{' with ' if overrides else ''}{' '.join(overrides)}"
+    return checked(Config, with_stage_parts(read_settings(path, overrides)), source)
 
 
 def to_dict(config: Config) -> dict[str, Any]:
@@ -312,14 +320,7 @@ def from_dict(settings: Mapping[str, Any]) -> Config:
     Raises:
         ValueError: as in `load_config`.
     """
-    return _checked(settings, "the configuration")
-
-
-def _checked(settings: Mapping[str, Any], source: str) -> Config:
-    try:
-        return _ADAPTER.validate_python(with_stage_parts(settings))
-    except ValidationError as error:
-        raise ValueError(in_words(error, Config, source)) from error
+    return checked(Config, with_stage_parts(settings), "the configuration")
 
 
 def with_stage_parts(settings: Mapping[str, Any]) -> dict[str, Any]:

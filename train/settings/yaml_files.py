@@ -6,10 +6,12 @@ import re
 import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import yaml
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
+
+Settings = TypeVar("Settings")
 
 #: The key by which a file names the one that it builds on.
 BASE: Final = "base"
@@ -44,17 +46,26 @@ def read_settings(path: Path | str, overrides: Sequence[str] = ()) -> dict[str, 
     return settings
 
 
-def in_words(error: ValidationError, kind: type, source: str) -> str:
-    """All that is wrong, a line each.
+def checked(kind: type[Settings], settings: dict[str, Any], source: str) -> Settings:
+    """The configuration that ``settings`` hold.
 
     Args:
-        error: pydantic's.
-        kind: the dataclass that was validated, for the names that are known.
-        source: where the settings are from.
+        kind: a dataclass of pydantic's.
+        settings: plain values.
+        source: where they are from.
 
-    Returns:
-        The message.
+    Raises:
+        ValueError: everything that is wrong, in one message: keys that are unknown, with the nearest that is known;
+            values out of range or of another kind; what is not set.
     """
+    try:
+        return TypeAdapter(kind).validate_python(settings)
+    except ValidationError as error:
+        raise ValueError(_in_words(error, kind, source)) from error
+
+
+def _in_words(error: ValidationError, kind: type, source: str) -> str:
+    """All that is wrong, a line each."""
     lines = [f"  {_line(problem, kind)}" for problem in error.errors(include_url=False)]
     return "\n".join([f"{source}:", *lines])
 
@@ -91,6 +102,7 @@ def _parse(text: str, source: str) -> Any:
 
 
 def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """``above`` over ``below``: mappings are merged, everything else is replaced."""
     both = {
         key: merged(below[key], above[key])
         for key in below.keys() & above.keys()
