@@ -3,7 +3,7 @@
 from setuptools import find_packages, setup
 
 #: Of train/, which is not part of the package.
-TRAIN = ["pydantic>=2.7", "PyYAML>=6", "tensorboard>=2.16.2"]
+TRAIN = ["huggingface_hub>=0.34", "Jinja2>=3.1", "pydantic>=2.7", "PyYAML>=6", "tensorboard>=2.16.2"]
 
 setup(
     name="vestcl",

@@ -116,7 +116,9 @@ def text(options: Card) -> str:
 def test_every_file_is_there(options: Card, text: str) -> None:
     names = {path.name for path in options.out.iterdir()}
     assert names == {"README.md", "curves.png", LOG, "config.yaml", "unseen_best.jpg", "unseen_worst.jpg"}
-    assert text.startswith("# vest-x\n") and "$" not in text
+    head, _, body = text.removeprefix("---\n").partition("\n---\n")
+    assert yaml.safe_load(head)["license"] == "apache-2.0" and yaml.safe_load(head)["library_name"] == "vestcl"
+    assert body.startswith("\n# vest-x\n") and "{{" not in text and "}}" not in text
     assert "![best window](unseen_best.jpg)" in text and "median window" not in text
     assert all((options.out / name).stat().st_size <= card_pictures.SHEET_BYTES for name in names if "jpg" in name)
 

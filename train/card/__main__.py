@@ -1,8 +1,9 @@
 """Write a model's card: `python -m train.card RUN --results FOLDER --out docs/vest-s`.
 
 All figures come from files: the run's log and last checkpoint, the prepared clips that it was trained on, and the
-results.json of `train.evaluate`, which must be of the very file that the card is of. The author's words stand in
-train/card.md. Written are README.md, curves.png, log.jsonl (thinned), config.yaml and the sheets of the results.
+results.json of `train.evaluate`, which must be of the very file that the card is of. The author's words are in
+train/card/card.md, a Jinja template. Written are README.md, curves.png, log.jsonl (thinned), config.yaml and the sheets
+of the results.
 """
 
 import dataclasses
@@ -12,11 +13,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from string import Template
 from typing import Any, Final
 
 import tyro
 import yaml
+from huggingface_hub import ModelCard, ModelCardData
 
 from train.card import pictures as card_pictures
 from train.card.pictures import Rows
@@ -44,6 +45,11 @@ _RESULTS: Final = {
 }  # fmt: skip
 
 _TEMPLATE: Final = Path(__file__).with_name("card.md")
+
+#: What huggingface.co shows of a model.
+_ABOUT: Final = ModelCardData(
+    license="apache-2.0", library_name="vestcl", tags=["video-prediction", "novel-view-synthesis", "driving"]
+)
 
 Results = list[tuple[Path, dict[str, Any]]]
 """Folders of `train.evaluate`, and their results.json."""
@@ -194,7 +200,7 @@ def _text(options: Card, state: TrainingState, rows: Rows, weights: Weights, res
         "longest": str(max(_horizons(config))),
         "commands": _commands(options, config, weights, results),
     }
-    return Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(sections)
+    return f"{ModelCard.from_template(_ABOUT, template_path=str(_TEMPLATE), **sections)}\n"
 
 
 def _about(config: Config, weights: Weights, step: int) -> str:
