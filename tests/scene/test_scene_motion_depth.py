@@ -15,7 +15,7 @@ from vestcl.data.readers.kitti_odometry import open_kitti_odometry
 from vestcl.data.readers.video import open_video
 from vestcl.data.sample import Clip, Sample
 from vestcl.io.labels import SKY
-from vestcl.scene import perception
+from vestcl.scene import measurements, perception
 from vestcl.scene.depth.from_motion import CAMERA_HEIGHT, MotionDepth, motion_depth
 from vestcl.scene.depth.stereo import stereo_depth
 from vestcl.scene.flow import optical_flow
@@ -75,7 +75,7 @@ def test_a_clips_motions_have_one_scale(monkeypatch: pytest.MonkeyPatch) -> None
         found.prev_from_cur[:3, 3] *= factor
         return found._replace(depth=found.depth * np.float32(factor))
 
-    monkeypatch.setattr(perception, "motion_depth", another_road)
+    monkeypatch.setattr(measurements, "motion_depth", another_road)
     seen = perception.Perception(Clip("corridor", "memory", tuple(samples)))
     lengths = [np.linalg.norm(motion[:3, 3]) for motion in seen.motions([1, 2, 3])]
     assert np.ptp(lengths) < 0.06 * lengths[-1]
@@ -89,7 +89,7 @@ def test_without_a_ratio_of_speeds_the_motion_before_is_as_fast(monkeypatch: pyt
     samples = [Sample.from_arrays(f"{i}", image, K) for i, image in enumerate(images)]
     made = motion_depth
     monkeypatch.setattr(
-        perception, "motion_depth", lambda *args, **options: made(*args, **options)._replace(speed_before=0.0)
+        measurements, "motion_depth", lambda *args, **options: made(*args, **options)._replace(speed_before=0.0)
     )
     seen = perception.Perception(Clip("corridor", "memory", tuple(samples)))
     assert not seen.prev_from_cur(2)[:3, 3].any()

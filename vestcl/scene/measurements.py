@@ -1,0 +1,233 @@
+"""What is measured of a clip's frames without a network: images, optical flow, depth, camera motion. Kept by frame."""
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vestcl.data.calibration import power
+from vestcl.data.sample import Clip
+from vestcl.io.labels import SKY
+from vestcl.scene.depth import CombinedDepth, combine_depth
+from vestcl.scene.depth.from_motion import MotionDepth, motion_depth
+from vestcl.scene.depth.lidar import densify
+from vestcl.scene.depth.stereo import stereo_depth
+from vestcl.scene.estimators.sources import EstimatedFrame
+from vestcl.scene.flow.correspondence import Correspondence, correspond
+from vestcl.scene.kept_results import KeptResults
+from vestcl.scene.motion.ego_motion import ego_motion
+from vestcl.scene.own_car import own_car
+from vestcl.scene.sky import sky_mask
+
+#: Standard deviation of a stereo pair's disparity, px, and the nearest depth that is searched for, m.
+_DISPARITY_STD, _NEAREST = 0.35, 2.0
+
+#: Standard deviation of any other depth's inverse, 1/m: 2 % at 10 m.
+_INVERSE_STD: Final = 0.002
+
+#: Depth maps with a smaller share of valid pixels are scans, to be densified.
+_DENSE: Final = 0.3
+
+#: From so many intervals on there is a gap between two frames. It is too long if flow is believed (its error forth and
+#: back, px) at less than that share of the pixels that it is believed at between the two frames before.
+_GAP, _BELIEVED, _LOST = 1.5, 1.0, 0.6
+
+#: A bonnet is looked for in so many last images.
+_COMPARED: Final = 4
+
+_LOG: Final = logging.getLogger(__name__)
+
+
+class Measurements(KeptResults):
+    """Measurements of the frames of a clip; `vestcl.scene.perception.Perception` lists where depth comes from.
+
+    Args:
+        clip: at its own size.
+        progress: called with the stage that begins.
+    """
+
+    def __init__(self, clip: Clip, progress: Callable[[str], None] | None = None) -> None:
+        super().__init__(progress)
+        self.clip = clip
+        self.has_labels = all(sample.labels is not None for sample in clip)
+        self._empty: set[int] = set()
+
+    def image(self, index: int) -> NDArray[np.float32]:
+        """[3, H, W]."""
+        return self.once("read", index, lambda: self.clip[index].read_image().copy())
+
+    def correspondence(self, index: int) -> Correspondence:
+        """From frame ``index`` to the one before."""
+        if not 1 <= index < len(self.clip):
+            raise ValueError(f"`index` must be 1 ... {len(self.clip) - 1}, a frame with one before, got {index}")
+        return self.once("flow", index, lambda: correspond(self.image(index), self.image(index - 1)))
+
+    def raw_depth(self, index: int) -> NDArray[np.float32]:
+        """[1, H, W] m as it was measured, 0 = invalid."""
+        return self.once("depth", index, lambda: self._depth(index))
+
+    def prev_from_cur(self, index: int) -> NDArray[np.float64]:
+        """[4, 4] m: the camera's motion from frame ``index`` to the one before."""
+        return self.once("ego-motion", index, lambda: self._ego_motion(index))
+
+    def motions(self, indices: Sequence[int]) -> list[NDArray[np.float64]]:
+        """`prev_from_cur` of consecutive frames, all in the scale of the last one where depth comes from motion.
+
+        There each frame's road gives it a scale of its own; parallax over three images gives the ratio of their speeds.
+        Where it does not, as in the first moment of a drive, the motion before is taken to be as fast.
+
+        Args:
+            indices: of the frames, rising by one.
+        """
+        motions = [self.prev_from_cur(i).copy() for i in indices]
+        for motion, before, index in zip(motions[:0:-1], motions[-2::-1], list(indices)[:0:-1], strict=True):
+            if not self._is_from_motion(index) or not motion[:3, 3].any():
+                continue
+            length, length_before = (float(np.linalg.norm(each[:3, 3])) for each in (motion, before))
+            ratio = self._from_motion(index).speed_before
+            if not ratio:
+                before[:3, 3] = motion[:3, 3]
+            elif length_before:
+                before[:3, 3] *= ratio * length / length_before
+        return motions
+
+    def scale_before(self, index: int) -> float:
+        """What lengths in the scale of frame ``index`` - 1 are multiplied with to be in that of frame ``index``."""
+        if index < 2 or not self._is_from_motion(index):
+            return 1.0
+        now, before = (float(np.linalg.norm(self.prev_from_cur(i)[:3, 3])) for i in (index, index - 1))
+        scaled = self._from_motion(index).speed_before * now
+        return scaled / before if scaled and before else 1.0
+
+    def is_lost(self, index: int) -> bool:
+        """Whether the frame before is too far away in time to be matched, and there is a motion before that."""
+        if index < 2 or self.clip.elapsed(index) < _GAP or self.is_lost(index - 1):
+            return False
+        now, before = ((self.correspondence(i).error < _BELIEVED).mean() for i in (index, index - 1))
+        return bool(now < _LOST * before)
+
+    def own(self, index: int) -> NDArray[np.bool_]:
+        """[1, H, W], True where the recording car itself is in the image: by the clip's own files; found in a video of
+        one camera, which may be a dashboard's."""
+        return self._untimed("own car", index, lambda: self._find_own(index))
+
+    def inverse_std(self, index: int) -> float:
+        """Standard deviation of 1 / depth, 1/m."""
+        sample = self.clip[index]
+        if sample.right is None or self._given_depth(index) is not None:
+            return _INVERSE_STD
+        return _DISPARITY_STD / -float(sample.K[0, 0] * sample.right.right_from_left[0, 3])
+
+    def is_monocular(self, index: int) -> bool:
+        """Whether depth comes, wholly or in part, from the motion of one camera."""
+        return self._is_estimated(index) or self._is_from_motion(index)
+
+    def _ego_motion(self, index: int) -> NDArray[np.float64]:
+        if self.is_lost(index):
+            return power(self.prev_from_cur(index - 1), self.clip.elapsed(index) / self.clip.elapsed(index - 1))
+        if self._is_estimated(index):
+            return self._combined(index).prev_from_cur
+        if self.is_monocular(index):
+            return self._from_motion(index).prev_from_cur
+        sample = self.clip[index]
+        static = ~self.own(index)
+        if self.has_labels:
+            static &= sample.read_mask()
+        found = ego_motion(self.raw_depth(index), static, self.correspondence(index), sample.K)
+        return found.dst_from_src
+
+    def _find_own(self, index: int) -> NDArray[np.bool_]:
+        sample = self.clip[index]
+        if sample.ego_vehicle is not None or not self.is_monocular(index):
+            return sample.read_ego_vehicle().copy()
+        since = range(index, max(index - _COMPARED, -1), -1)
+        first = next((i for i in since if self.is_lost(i)), 0)
+        return own_car([self.image(i) for i in since if i >= first])
+
+    def _sky(self, index: int, depth: NDArray[np.float32] | None = None) -> NDArray[np.bool_]:
+        sample = self.clip[index]
+        if self.has_labels:
+            return sample.read_labels() == SKY
+        if depth is not None and sample.right is not None and self._given_depth(index) is None:
+            return sky_mask(self.image(index), self.raw_depth(index), matched=True)
+        return sky_mask(self.image(index), depth)
+
+    def _depth(self, index: int) -> NDArray[np.float32]:
+        sample, depth = self.clip[index], self._given_depth(index)
+        if self._is_estimated(index):
+            return self._combined(index).depth
+        if depth is not None:
+            return depth if (depth > 0).mean() >= _DENSE else densify(depth, self.image(index), sky=self._sky(index))
+        if sample.right is None:
+            return self._from_motion(index).depth
+        focal = -float(sample.K[0, 0] * sample.right.right_from_left[0, 3])
+        searched = min(math.ceil(focal / _NEAREST), sample.width // 2)
+        pair = self.image(index), sample.right.read_as(sample.K, sample.height, sample.width)
+        rig = sample.right.right_from_left
+        return stereo_depth(*pair, sample.K, rig, max_disparity=searched, fill=False)
+
+    def _given_depth(self, index: int) -> NDArray[np.float32] | None:
+        """The clip's own depth [1, H, W] m, 0 = invalid; None where it has none, or a map without a valid pixel."""
+        return self._untimed("given depth", index, lambda: self._read_depth(index))
+
+    def _read_depth(self, index: int) -> NDArray[np.float32] | None:
+        sample = self.clip[index]
+        if sample.depth is None:
+            return None
+        depth = sample.read_depth()
+        if (depth > 0).any():
+            return depth.copy()
+        if index not in self._empty:
+            self._empty.add(index)
+            file = getattr(sample.depth, "path", None) or "its depth"
+            instead = "motion" if sample.right is None else "the stereo pair"
+            _LOG.warning(
+                "%s: frame %s: %s has no valid depth; it comes from %s", self.clip.name, sample.name, file, instead
+            )
+        return None
+
+    def _is_from_motion(self, index: int) -> bool:
+        return self.clip[index].right is None and self._given_depth(index) is None
+
+    def _is_estimated(self, index: int) -> bool:
+        """Whether depth is a network's, to be combined with motion's: without a stereo pair, or without a unit."""
+        sample = self.clip[index]
+        if not isinstance(sample.depth, EstimatedFrame) or self._given_depth(index) is None:
+            return False
+        return sample.right is None or not sample.depth.metric
+
+    def _combined(self, index: int) -> CombinedDepth:
+        return self.once("combined depth", index, lambda: self._combine(index))
+
+    def _combine(self, index: int) -> CombinedDepth:
+        sample, estimate = self.clip[index], self._given_depth(index)
+        assert estimate is not None and isinstance(sample.depth, EstimatedFrame)
+        static = ~self.own(index)
+        if sample.labels is not None:
+            static &= sample.read_mask()
+        if len(self.clip) == 1 or self.is_lost(index):
+            frames = [index]
+        elif index == 0:
+            frames = [1, 0]
+        else:
+            frames = list(range(index - 1 if self.is_lost(index - 1) else max(index - 2, 0), index + 1))
+        known = self.correspondence(index) if len(frames) > 1 and index > 0 else None
+        images = [self.image(i) for i in frames]
+        metric = sample.depth.metric
+        return combine_depth(estimate, images, sample.K, metric=metric, static=static, correspondence=known)
+
+    def _from_motion(self, index: int) -> MotionDepth:
+        if len(self.clip) < 2:
+            raise ValueError(f"{self.clip.name}: needs two frames, a right camera or depth, got one frame alone")
+        if index == 0:  # nothing is before it, so what comes after has to do
+            return self.once("motion depth", 0, lambda: motion_depth([self.image(1), self.image(0)], self.clip[0].K))
+        if self.is_lost(index):
+            alone = [self.image(index)] * 2
+            return self.once("motion depth", index, lambda: motion_depth(alone, self.clip[index].K))
+        first = index - 1 if self.is_lost(index - 1) else max(index - 2, 0)
+        images = [self.image(i) for i in range(first, index + 1)]
+        known = self.correspondence(index)
+        return self.once("motion depth", index, lambda: motion_depth(images, self.clip[index].K, correspondence=known))
