@@ -6,7 +6,8 @@ import torch
 from data_files import pose
 from geometric_scenes import HEIGHT, WIDTH, Floats, K, Matrix, cloud_of, decibels, flat, noise, planes, room
 
-from vestcl.forecasting.geometric.render import FrameCloud, Shown, holes, rendered, show
+from vestcl.forecasting.geometric.frame_cloud import FrameCloud
+from vestcl.forecasting.geometric.render import Shown, holes, rendered, show
 from vestcl.scene.flow.optical_flow import backward_warp
 
 EYE = np.eye(4)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vestcl.data import Street, intrinsics, street_clip
 from vestcl.data.sample import Clip
-from vestcl.forecasting.geometric.render import FrameCloud
+from vestcl.forecasting.geometric.frame_cloud import FrameCloud
 from vestcl.scene.flow.correspondence import Correspondence
 
 Floats = NDArray[np.float32]

@@ -11,7 +11,8 @@ from vestcl.data import calibration
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.street.clip import Shot, StreetImage
 from vestcl.evaluation import metrics
-from vestcl.forecasting.geometric.render import FrameCloud, show
+from vestcl.forecasting.geometric.frame_cloud import FrameCloud
+from vestcl.forecasting.geometric.render import show
 from vestcl.forecasting.result import Forecast
 from vestcl.io.labels import SKY, background
 

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
+from vestcl.forecasting.geometric.frame_cloud import FrameCloud
 from vestcl.forecasting.geometric.memory import MEMORY, SceneMemory, remember
 from vestcl.forecasting.geometric.paths import Paths, forecast_cameras, point_paths
-from vestcl.forecasting.geometric.render import FrameCloud, Shown, holes, rendered, show
+from vestcl.forecasting.geometric.render import Shown, holes, rendered, show
 from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.scene.exposure import as_exposed
 from vestcl.scene.inpainting.holes import deep_holes, fill_holes
