@@ -63,12 +63,7 @@ def move_objects(
     found = _where(network, moving, options, tally)
     if not found:
         return unmoved(start)
-    seen = [prev.features, cur.features]
-    seen += [prev.layers.depth, cur.layers.depth, prev.layers.mask, cur.layers.mask]
-    backgrounds = list[torch.Tensor]()
-    if network.config.inpainted:
-        backgrounds += [prev.background_features, cur.background_features]
-        backgrounds += [prev.layers.background_depth, cur.layers.background_depth]
+    seen, backgrounds = _planes(prev, cur, network.config.inpainted)
     flows = list(zip((prev, cur), to_next[:2], flow0.split(3, dim=1), strict=True))
     pieces, forecasts = list[_Piece](), list[ObjectMotionForecast]()
     for box in found:
@@ -84,15 +79,20 @@ def move_objects(
             network(*map(box.cut, seen), box.cut(start) - beyond, blocks=options.blocks, backgrounds=behind)
         )
 
-    def whole(parts: Iterable[torch.Tensor]) -> torch.Tensor:
-        flow = start.clone()
-        for piece, part in zip(pieces, parts, strict=True):
-            piece.box.cut(flow).copy_(piece.finished(part))
-        return flow
-
     learning = torch.is_grad_enabled()  # losses alone look at candidates
-    candidates = [whole(each) for each in zip(*(one.candidates for one in forecasts), strict=True)] if learning else []
-    return forecasts[0]._replace(flow=whole(one.flow for one in forecasts), candidates=candidates)
+    each = zip(*(one.candidates for one in forecasts), strict=True) if learning else ()
+    candidates = [_whole(start, pieces, parts) for parts in each]
+    return forecasts[0]._replace(flow=_whole(start, pieces, [one.flow for one in forecasts]), candidates=candidates)
+
+
+def _planes(prev: EncodedFrame, cur: EncodedFrame, inpainted: bool) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """What OMF sees of both frames, and of their backgrounds if it sees them."""
+    seen = [prev.features, cur.features]
+    seen += [prev.layers.depth, cur.layers.depth, prev.layers.mask, cur.layers.mask]
+    if not inpainted:
+        return seen, []
+    features = [prev.background_features, cur.background_features]
+    return seen, [*features, prev.layers.background_depth, cur.layers.background_depth]
 
 
 class _Piece(NamedTuple):
@@ -113,6 +113,14 @@ class _Piece(NamedTuple):
             return flow
         flow, start = (motion.unflatten(1, (2, 3)) for motion in (flow, self.start))
         return torch.where(self.moves[:, :, None], flow, start).flatten(1, 2)
+
+
+def _whole(start: torch.Tensor, pieces: Iterable[_Piece], parts: Iterable[torch.Tensor]) -> torch.Tensor:
+    """``start`` with OMF's answer in each piece."""
+    flow = start.clone()
+    for piece, part in zip(pieces, parts, strict=True):
+        piece.box.cut(flow).copy_(piece.finished(part))
+    return flow
 
 
 def _rolling(foreground: torch.Tensor, beside: torch.Tensor) -> torch.Tensor:

@@ -120,11 +120,10 @@ def splat_cloud(
 ) -> Side:
     """Show a cloud in ``camera``: opaque points of radius r = rho z_src / z_tgt f_tgt / f_src, clamped to RADIUS.
 
-    Points that come so near that rho z_src / z_tgt is beyond RADIUS are left out, as
-    `vestcl.forecasting.geometric.render` leaves
-    them out: a ball of that size hides what it is not. A longer focal length leaves out none. With ``config.stretched``
-    r grows with the distance to what was beside a point, and points that nothing is beside any more are left out, too:
-    see `_surface`.
+    Points that come so near that rho z_src / z_tgt is beyond RADIUS are left out, as `vestcl.forecasting.geometric`
+    leaves them out: a ball of that size hides what it is not. A longer focal length leaves out none. With
+    ``config.stretched`` r grows with the distance to a point's former neighbours, and points without neighbours are
+    left out, too: see `_surface`.
 
     Args:
         cloud: of B images.
@@ -144,16 +143,9 @@ def splat_cloud(
         What is seen; differentiable in the cloud, through positions, radii and inverse depth.
     """
     points_uv, z = _project(cloud, camera)
-    near = z.clamp(min=constants.NEAR)
+    near, order = z.clamp(min=constants.NEAR), z.detach()
     zoom = (camera.K[:, 0, 0] * camera.K[:, 1, 1] / (K[:, 0, 0] * K[:, 1, 1])).sqrt()
-    zoom_of_point = zoom.repeat_interleave(cloud.starts.diff())
-    magnified = zoom_of_point * cloud.depth / near
-    opacities = (config.rho * (cloud.depth / near).detach() <= RADIUS[1]).to(z)
-    if config.stretched:
-        factor, whole = _surface(points_uv.detach(), magnified.detach(), cloud.grids)
-        opacities, magnified = opacities * whole, magnified * factor
-    radii = (config.rho * magnified).clamp(*RADIUS)
-    order = z.detach()
+    radii, opacities = _sizes(cloud, zoom, points_uv, near, config)
     if config.inpainted != "own":
         order = order + _BEHIND * cloud.inpainted
     starts = cloud.starts
@@ -174,6 +166,18 @@ def splat_cloud(
     known = torch.cat([cloud.colour, near.reciprocal()[:, None], *measured], dim=1)
     features, coverage = composite(raster, cloud.features, None, min_transmittance)
     return Side(features, composite(raster, known, None, min_transmittance)[0], coverage)
+
+
+def _sizes(
+    cloud: Cloud, zoom: torch.Tensor, points_uv: torch.Tensor, near: torch.Tensor, config: RenderConfig
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Radii [N] px and opacities [N], 1 or 0, of points at depths ``near``; ``zoom`` [B] is f_tgt / f_src."""
+    magnified = zoom.repeat_interleave(cloud.starts.diff()) * cloud.depth / near
+    opacities = (config.rho * (cloud.depth / near).detach() <= RADIUS[1]).to(near)
+    if config.stretched:
+        factor, whole = _surface(points_uv.detach(), magnified.detach(), cloud.grids)
+        opacities, magnified = opacities * whole, magnified * factor
+    return (config.rho * magnified).clamp(*RADIUS), opacities
 
 
 def inner_holes(hole: torch.Tensor) -> torch.Tensor:
