@@ -39,32 +39,40 @@ def span(name: str) -> Iterator[None]:
 
 @dataclass
 class Clock:
-    """Seconds by stage, summed up until `take`. A stage's time is without the stages of this clock inside it."""
+    """Seconds by stage, summed up until `take`."""
 
     seconds: dict[str, float] = field(default_factory=dict)
+    cpu_seconds: dict[str, float] = field(default_factory=dict)
+    """Of all threads of the process."""
     seen: Seen | None = None
     """Called after each stage that has a result to show, outside of what is timed."""
     outer: "Clock | None" = field(default=None, repr=False, compare=False)
     """The clock of the ``with`` block around this one's: it runs as well."""
-    _inner: float = field(default=0.0, repr=False, compare=False)
+    exclusive: bool = False
+    """Whether a stage's time is without the stages of this clock inside it."""
+    _inner: tuple[float, float] = field(default=(0.0, 0.0), repr=False, compare=False)
+    """Of the stages inside the current one: seconds, and the CPU's."""
 
     @contextlib.contextmanager
-    def stage(self, name: str) -> Iterator[None]:
+    def time(self, name: str) -> Iterator[None]:
         """Time the ``with`` block, whether it ends well or not; it is a `span`, too."""
-        outside, self._inner, start = self._inner, 0.0, time.perf_counter()
+        around, self._inner = self._inner, (0.0, 0.0)
+        start, cpu_start = time.perf_counter(), time.process_time()
         try:
             with span(name):
                 yield
         finally:
-            taken = time.perf_counter() - start
-            self.add(name, taken - self._inner)
-            self._inner = outside + taken
+            wall, cpu = time.perf_counter() - start, time.process_time() - cpu_start
+            inner, cpu_inner = self._inner if self.exclusive else (0.0, 0.0)
+            self.add(name, wall - inner, cpu - cpu_inner)
+            self._inner = around[0] + wall, around[1] + cpu
 
-    def add(self, name: str, seconds: float) -> None:
+    def add(self, name: str, seconds: float, cpu_seconds: float) -> None:
         """Add to this clock and to all outer ones."""
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+        self.cpu_seconds[name] = self.cpu_seconds.get(name, 0.0) + cpu_seconds
         if self.outer is not None:
-            self.outer.add(name, seconds)
+            self.outer.add(name, seconds, cpu_seconds)
 
     def show(self, name: str, result: Any) -> None:
         """Call ``seen`` of this clock and of all outer ones."""
@@ -74,8 +82,8 @@ class Clock:
             self.outer.show(name, result)
 
     def take(self) -> dict[str, float]:
-        """What was measured since the last time."""
-        taken, self.seconds = self.seconds, {}
+        """What was measured since the last time, without the CPU's."""
+        taken, self.seconds, self.cpu_seconds = self.seconds, {}, {}
         return taken
 
 

@@ -13,6 +13,7 @@ import pytest
 import torch
 from forecaster_scenes import SMALL, camera, frame, measured, stir
 
+from vestcl.clock import Clock
 from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip
 from vestcl.forecasting.geometric import Perception
@@ -201,3 +202,14 @@ def test_a_threads_clock_is_its_own() -> None:
         ended.wait()
     other.join()
     assert watch.seconds == {} and tally.counts == {}
+
+
+def test_a_clock_counts_stages_inside_stages_once_or_twice() -> None:
+    """By default an outer stage has the inner one's time, of the wall and of the CPU; an exclusive clock's has not."""
+    for exclusive in (False, True):
+        clock = Clock(exclusive=exclusive)
+        with clock.time("outer"), clock.time("inner"):
+            sum(range(200_000))
+        assert set(clock.seconds) == set(clock.cpu_seconds) == {"outer", "inner"}
+        assert (clock.seconds["outer"] < clock.seconds["inner"]) is exclusive
+        assert (clock.cpu_seconds["outer"] < clock.cpu_seconds["inner"]) is exclusive

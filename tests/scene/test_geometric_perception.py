@@ -278,7 +278,7 @@ def test_seconds_are_exclusive(monkeypatch: pytest.MonkeyPatch) -> None:
 
     clip = drive(4).clip
     samples = (replace(s, image=slow(s, "image", 1), depth=slow(s, "depth", 10)) for s in clip)
-    told = SimpleNamespace(perf_counter=lambda: clock[0], perf_counter_ns=lambda: 0)
+    told = SimpleNamespace(perf_counter=lambda: clock[0], perf_counter_ns=lambda: 0, process_time=lambda: 0.0)
     monkeypatch.setattr("vestcl.clock.time", told)
     perception = Perception(replace(clip, samples=tuple(samples)))
     perception.seen(FRAME)

@@ -63,7 +63,7 @@ class _Stages:
     def stage(self, name: str) -> Iterator[Callable[[float], None]]:
         """Times the block; yields what it may tell its share done to."""
         self.show(name, 0.0)
-        with self.clock.stage(name):
+        with self.clock.time(name):
             yield lambda share: self.show(name, share)
 
     def show(self, name: str, share: float) -> None:

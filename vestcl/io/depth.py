@@ -47,10 +47,7 @@ def read_depth(
     Source: SPEC section 8.
     """
     suffix = Path(path).suffix.lower()
-    if units_per_metre is None and suffix == ".png":
-        raise ValueError(f"{path}: `units_per_metre` is missing; a depth PNG needs it (KITTI 256, Virtual KITTI 100)")
-    if units_per_metre is not None and not (np.isfinite(units_per_metre) and units_per_metre > 0):
-        raise ValueError(f"`units_per_metre` must be positive, got {units_per_metre}")
+    _check_units(path, suffix, units_per_metre)
     if suffix == ".png":
         values: NDArray[np.generic] = _read_png(path)
     elif suffix == ".exr":
@@ -104,10 +101,7 @@ def write_depth(path: str | Path, depth: ArrayLike, units_per_metre: float | Non
     if metres.ndim != 2:
         raise ValueError(f"`depth` must be [H, W] or [1, H, W], got {list(metres.shape)}")
     suffix = Path(path).suffix.lower()
-    if units_per_metre is None and suffix == ".png":
-        raise ValueError(f"{path}: `units_per_metre` is missing; a depth PNG needs it (KITTI 256, Virtual KITTI 100)")
-    if units_per_metre is not None and not (np.isfinite(units_per_metre) and units_per_metre > 0):
-        raise ValueError(f"`units_per_metre` must be positive, got {units_per_metre}")
+    _check_units(path, suffix, units_per_metre)
     values = _known(metres.astype(np.float64)).astype(np.float64) * (units_per_metre or 1.0)
     if suffix == ".png":
         steps = np.where(values > 0, np.rint(values).clip(1, _DEEPEST), 0)
@@ -127,6 +121,13 @@ def _known(metres: NDArray[np.float64]) -> NDArray[np.float32]:
     with np.errstate(over="ignore", under="ignore"):
         depth = metres.astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def _check_units(path: str | Path, suffix: str, units_per_metre: float | None) -> None:
+    if units_per_metre is None and suffix == ".png":
+        raise ValueError(f"{path}: `units_per_metre` is missing; a depth PNG needs it (KITTI 256, Virtual KITTI 100)")
+    if units_per_metre is not None and not (np.isfinite(units_per_metre) and units_per_metre > 0):
+        raise ValueError(f"`units_per_metre` must be positive, got {units_per_metre}")
 
 
 def _read_png(path: str | Path) -> NDArray[np.uint16]:

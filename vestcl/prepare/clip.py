@@ -115,7 +115,7 @@ def _complete(
 ) -> tuple[Outcome, list[str]]:
     """Write what is missing; returns what was done, and the frames' keys."""
     clock = Clock()
-    with clock.stage("check"):
+    with clock.time("check"):
         if perception.clip is not clip:  # the right images are in no frame's key otherwise
             estimators += f"|targets {_digest_of(clip).hex()}"
         keys = frame_keys(perception.clip, estimators)
@@ -136,9 +136,9 @@ def _complete(
 def _write(clip: Clip, perception: Perception, folder: Path, index: int, key: str, clock: Clock) -> None:
     """Compute and write a frame; ``clock`` has what perception's has not."""
     frame, camera = perception.seen(index), clip[index].right
-    with clock.stage("right"):
+    with clock.time("right"):
         right = None if camera is None else camera.read_image()
-    with clock.stage("write"), _explained(frame_path(folder, index)):
+    with clock.time("write"), _explained(frame_path(folder, index)):
         write_frame(folder, index, key, frame, right)
 
 

@@ -22,7 +22,7 @@ class KeptResults:
     """
 
     def __init__(self, progress: Callable[[str], None] | None = None) -> None:
-        self._clock = Clock()
+        self._clock = Clock(exclusive=True)
         self.seconds = self._clock.seconds
         self._progress = progress
         self._kept: dict[tuple[str, int], Any] = {}
@@ -50,7 +50,7 @@ class KeptResults:
         key = (name, index)
         with self._lock:
             if key not in self._kept:
-                with self._clock.stage(stage):
+                with self._clock.time(stage):
                     self._kept[key] = compute()
                 self._forget(index)
             result: Result = self._kept[key]

@@ -5,6 +5,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vestcl.data.resize import check_size
+
 Array = NDArray[np.float64]
 
 #: Focal length over image width, as in KITTI.
@@ -26,17 +28,6 @@ def are_rigid(poses: Array) -> bool:
     square = rotation @ rotation.transpose(0, 2, 1)
     straight = np.allclose(square, np.eye(3), atol=ROTATION_TOLERANCE) and np.all(np.linalg.det(rotation) > 0)
     return bool(straight and np.isfinite(poses).all() and np.all(poses[:, 3] == [0, 0, 0, 1]))
-
-
-def check_size(height: int, width: int) -> None:
-    """Refuse what is no image size.
-
-    Raises:
-        ValueError: ``height`` or ``width`` is no positive integer.
-    """
-    for name, size in (("height", height), ("width", width)):
-        if not isinstance(size, int | np.integer) or size < 1:
-            raise ValueError(f"`{name}` must be a positive integer, got {size!r}")
 
 
 def check_samples(samples: int) -> None:

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data import calibration
+from vestcl.data.resize import check_size
 from vestcl.data.sample import Clip, RightCamera, Sample
-from vestcl.data.street.camera import check_samples, check_size, intrinsics
+from vestcl.data.street.camera import check_samples, intrinsics
 from vestcl.data.street.raycast import Frame
 from vestcl.data.street.street import Street
 

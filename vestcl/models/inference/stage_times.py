@@ -46,7 +46,7 @@ def timed(method: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     @functools.wraps(method)
     def stage(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
         clock = current_clock()
-        with clock.stage(name):
+        with clock.time(name):
             result = method(*arguments, **named)
         clock.show(name, result)
         return result
