@@ -12,7 +12,7 @@ from PIL import Image
 
 from vestcl.evaluation import metrics
 from vestcl.forecasting.baselines import flow_extrapolation, repeat_last
-from vestcl.scene.flow.optical_flow import backward_warp, invert_flow, optical_flow
+from vestcl.scene.flow.optical_flow import backward_warp, optical_flow
 
 CLIP = Path(__file__).resolve().parents[3] / "shared" / "data" / "kitti_clip" / "image"
 
@@ -80,76 +80,28 @@ def test_optical_flow_of_a_shift(texture: Any) -> None:
     assert float((inner - wanted).abs().mean()) < 0.05
 
 
-@pytest.mark.parametrize("follow", ["place", "point"])
-def test_a_moving_texture_is_followed(texture: Any, follow: Any) -> None:
+def test_a_moving_texture_is_followed(texture: Any) -> None:
     x, y = pixel_centres()
     at = [texture(x - 1.7 * t, y + 0.6 * t) for t in range(-1, 5)]
     truth = torch.cat(at[2:])
-    frames = flow_extrapolation(at[0], at[1], 4, follow)
+    frames = flow_extrapolation(at[0], at[1], 4)
     assert frames.shape == (1, 4, 3, HEIGHT, WIDTH)
     repeated = psnr_by_step(repeat_last(at[0], at[1], 4), truth)
     assert (psnr_by_step(frames, truth) > repeated + 10).all()
 
 
 def test_driving_forward_a_place_keeps_its_flow(texture: Any) -> None:
-    """A zoom by the same factor every step, as in a corridor: exact for "place", linear for "point"."""
+    """A zoom by the same factor every step, as in a corridor."""
     x, y = (centre - size / 2 for centre, size in zip(pixel_centres(), (WIDTH, HEIGHT), strict=True))
     at = [texture(x / 1.04**t, y / 1.04**t) for t in range(-1, 6)]
     truth = torch.cat(at[2:])
-    place, point = (psnr_by_step(flow_extrapolation(at[0], at[1], 5, follow), truth) for follow in ("place", "point"))
     repeated = psnr_by_step(repeat_last(at[0], at[1], 5), truth)
-    assert (place > repeated + 6).all() and (place[2:] > point[2:] + 2).all()
+    assert (psnr_by_step(flow_extrapolation(at[0], at[1], 5), truth) > repeated + 6).all()
 
 
-def test_an_object_before_a_background_at_rest_keeps_its_motion(texture: Any) -> None:
-    """Its motion goes with it for "point"; for "place" it stays where it was, and the object does not arrive."""
-    x, y = pixel_centres()
-    step = 6
-
-    def frame(t: int) -> torch.Tensor:
-        is_object = ((x - 40 - step * t).abs() < 20) & ((y - 48).abs() < 24)
-        return torch.where(is_object, texture(x - step * t + 300, y), texture(x, y))
-
-    point, place = (flow_extrapolation(frame(-1), frame(0), 3, follow)[:, 2] for follow in ("point", "place"))
-    inside = (((x - 40 - 3 * step).abs() < 16) & ((y - 48).abs() < 20))[None, None]
-    assert float(metrics.psnr(point, frame(3), inside)) > float(metrics.psnr(place, frame(3), inside)) + 6
-
-
-def test_invert_flow_of_a_shift_fills_its_hole() -> None:
-    flow_uv = torch.zeros(1, 2, 5, 6)
-    flow_uv[:, 0] = 2
-    torch.testing.assert_close(invert_flow(flow_uv), -flow_uv)
-    assert torch.equal(invert_flow(torch.zeros(2, 2, 3, 4)), torch.zeros(2, 2, 3, 4))
-
-
-def test_invert_flow_lets_the_fastest_win() -> None:
-    flow_uv = torch.zeros(1, 2, 1, 5)
-    flow_uv[0, 0, 0, 1] = 2  # lands on pixel 3, which stays, and leaves a hole at 1
-    inverted = invert_flow(flow_uv)[0, 0, 0].tolist()
-    assert inverted[0] == 0 and inverted[2:] == [0, -2, 0]
-    flow_uv[0, 0, 0, 3] = -3  # lands on pixel 0; the hole lies between motions of 3 and 0
-    inverted = invert_flow(flow_uv)[0, 0, 0].tolist()
-    assert inverted[0] == 3 and 0 < inverted[1] < 3 and inverted[2:] == [0, -2, 0]
-
-
-def test_invert_flow_of_what_has_left_is_zero() -> None:
-    flow_uv = torch.full((1, 2, 4, 5), 100.0)
-    flow_uv[0, 1, 2, 2] = math.nan
-    assert torch.equal(invert_flow(flow_uv), torch.zeros(1, 2, 4, 5))
-
-
-def test_invert_flow_there_and_back(texture: Any) -> None:
-    """A smooth motion inverted: b(p + f(p)) = -f(p)."""
-    x, y = pixel_centres()
-    flow_uv = torch.stack([3 * (y / 20).sin() + 0.05 * x, 2 * (x / 25).cos()])[None]
-    returned = backward_warp(invert_flow(flow_uv), flow_uv)
-    assert float((returned + flow_uv)[..., 12:-12, 12:-12].abs().max()) < 0.5
-
-
-@pytest.mark.parametrize("follow", ["place", "point"])
-def test_a_still_scene_stays(texture: Any, follow: Any) -> None:
+def test_a_still_scene_stays(texture: Any) -> None:
     frame = texture(*pixel_centres())
-    frames = flow_extrapolation(frame, frame, 2, follow)
+    frames = flow_extrapolation(frame, frame, 2)
     torch.testing.assert_close(frames, repeat_last(frame, frame, 2), atol=1e-4, rtol=0)
 
 
@@ -170,11 +122,9 @@ def test_batch_and_order_do_not_matter(texture: Any) -> None:
             lambda i: flow_extrapolation(i, i[..., :-1], 1),
             r"`frame_cur` must be \[1, 3, 16, 16\], got \[1, 3, 16, 15",
         ),
-        (lambda i: flow_extrapolation(i, i, 1, "points"), '`follow` must be "place" or "point", got \'points\''),
         (lambda i: optical_flow(i[..., :8], i[..., :8]), "H and W must be 12 or more for optical flow, got 16 x 8"),
         (lambda i: optical_flow(i[:, :1], i), r"`src` must be \[B, 3, H, W\], got \[1, 1, 16, 16\]"),
         (lambda i: backward_warp(i, i), r"`flow_uv` must be \[1, 2, 16, 16\], got \[1, 3, 16, 16\]"),
-        (lambda i: invert_flow(i), r"`flow_uv` must be \[B, 2, H, W\], got \[1, 3, 16, 16\]"),
     ],
 )
 def test_refuses(call: Any, message: str) -> None:
@@ -189,6 +139,5 @@ def test_real_driving() -> None:
     at = [torch.from_numpy(frame.copy()).permute(2, 0, 1)[None].float() / 255 for frame in pixels]
     truth = torch.cat(at[2:])
     repeated = metrics.psnr(repeat_last(at[0], at[1], 4)[0], truth)
-    for follow in ("place", "point"):
-        followed = metrics.psnr(flow_extrapolation(at[0], at[1], 4, follow)[0], truth)
-        assert (followed > repeated + 3).all()
+    followed = metrics.psnr(flow_extrapolation(at[0], at[1], 4)[0], truth)
+    assert (followed > repeated + 3).all()

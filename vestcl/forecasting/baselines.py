@@ -3,15 +3,10 @@
 Both take the two last frames and answer with [B, steps, 3, H, W]: the frames at t+1 to t+steps.
 """
 
-from typing import Literal
-
 import torch
 
-from vestcl.scene.flow.optical_flow import backward_warp, invert_flow, optical_flow
+from vestcl.scene.flow.optical_flow import backward_warp, optical_flow
 from vestcl.shapes import check
-
-Follow = Literal["place", "point"]
-"""What keeps its velocity: a place of the image (whatever passes through it), or each point that moves."""
 
 
 def repeat_last(frame_prev: torch.Tensor, frame_cur: torch.Tensor, steps: int) -> torch.Tensor:
@@ -33,19 +28,14 @@ def repeat_last(frame_prev: torch.Tensor, frame_cur: torch.Tensor, steps: int) -
 
 
 def flow_extrapolation(
-    frame_prev: torch.Tensor, frame_cur: torch.Tensor, steps: int, follow: Follow = "place", *, elapsed: float = 1.0
+    frame_prev: torch.Tensor, frame_cur: torch.Tensor, steps: int, *, elapsed: float = 1.0
 ) -> torch.Tensor:
     """I_(t+k)(p) = I_t(p + b_k(p)) with the motion b_k from t+k back to t at constant velocity.
 
-    f(p) is the flow from t to t-1 (OpenCV's DIS), divided by ``elapsed``. What stays constant is a choice:
-
-    - "place": the flow at each place of the image. b_1 = f, b_(k+1)(p) = b_k(p) + f(p + b_k(p)): a streamline is
-      followed backwards. Nothing is left empty. It holds where a camera drives through a static scene, as what comes
-      to a place of the image next is about as deep as what is there now, and it is right to second order there: on
-      KITTI's driving 0.5 to 1 dB better at t+3 and t+5 than "point".
-    - "point": each point p of frame t moves on to p - k f(p). That map is inverted (`invert_flow`): of several points
-      on a pixel the fastest, in driving the nearest, wins, and holes are stretched over. It holds for objects that
-      move by themselves before a background that does not.
+    f(p) is the flow from t to t-1 (OpenCV's DIS), divided by ``elapsed``. The flow at each place of the image stays
+    constant: b_1 = f, b_(k+1)(p) = b_k(p) + f(p + b_k(p)), a streamline followed backwards. Nothing is left empty. That
+    holds where a camera drives through a static scene, as what comes to a place of the image next is about as deep as
+    what is there now, and it is right to second order there.
 
     Where p + b_k(p) is outside the image, its border is repeated.
 
@@ -53,31 +43,24 @@ def flow_extrapolation(
         frame_prev: [B, 3, H, W] in [0, 1], RGB, at t-1.
         frame_cur: [B, 3, H, W] in [0, 1], RGB, at t.
         steps: frames to forecast, 1 or more.
-        follow: "place" or "point".
         elapsed: intervals from t-1 to t; a step is one interval.
 
     Returns:
         [B, steps, 3, H, W]; no gradient.
 
     Raises:
-        ValueError: shapes don't fit, an image below FLOW_SIDE, no steps, ``follow`` is neither word, or ``elapsed`` is
-            not above 0.
+        ValueError: shapes don't fit, an image below FLOW_SIDE, no steps, or ``elapsed`` is not above 0.
 
     Source: SPEC section 10; Kroeger et al., Fast Optical Flow using Dense Inverse Search, 2016.
     """
     _check(frame_prev, frame_cur, steps)
-    if follow not in ("place", "point"):
-        raise ValueError(f'`follow` must be "place" or "point", got {follow!r}')
     if not elapsed > 0:
         raise ValueError(f"`elapsed` must be above 0, got {elapsed}")
     with torch.no_grad():
         prev_from_cur = optical_flow(frame_cur, frame_prev) / elapsed
         back, frames = torch.zeros_like(prev_from_cur), []
-        for step in range(1, steps + 1):
-            if follow == "place":
-                back = back + backward_warp(prev_from_cur, back)
-            else:
-                back = invert_flow(-step * prev_from_cur)
+        for _ in range(steps):
+            back = back + backward_warp(prev_from_cur, back)
             frames.append(backward_warp(frame_cur, back))
         return torch.stack(frames, dim=1)
 
