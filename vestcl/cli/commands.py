@@ -16,6 +16,9 @@ from vestcl.evaluation.st_lpips import Option as StLpipsOption
 class Devices:
     """List the OpenCL devices of this machine."""
 
+    threads: int | None = None
+    """CPU threads of torch, OpenCV and PoCL. Without it: as many as there are cores."""
+
 
 @dataclass(frozen=True)
 class Doctor:
@@ -23,6 +26,8 @@ class Doctor:
 
     timeout: float = 120.0
     """Seconds that a device may take."""
+    threads: int | None = None
+    """CPU threads of torch, OpenCV and PoCL. Without it: as many as there are cores."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,8 @@ class Demo:
     """vest-s, a .safetensors file, a checkpoint's folder, or geometric. Without it: vest-s, where it is installed."""
     quality: Literal["exact", "balanced", "fast"] = "balanced"
     """How exactly the network computes."""
+    threads: int | None = None
+    """CPU threads of torch, OpenCV and PoCL. Without it: as many as there are cores."""
     device: str | None = None
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
 
@@ -78,6 +85,8 @@ class ClipOptions:
     """Cityscapes: name of the annotated frame, if there are several."""
     variant: str | None = None
     """Virtual KITTI: clone, fog ..., if there are several."""
+    threads: int | None = None
+    """CPU threads of torch, OpenCV and PoCL. Without it: as many as there are cores."""
 
 
 @dataclass(frozen=True)

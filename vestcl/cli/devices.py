@@ -8,6 +8,12 @@ from rich.text import Text
 from vestcl import doctor, opencl
 from vestcl.cli.commands import Devices, Doctor
 
+#: What commands set by themselves, and programs have to.
+PROGRAMS = (
+    "in programs of your own set OMP_WAIT_POLICY=passive before torch is imported: else its threads keep cores busy "
+    "that OpenCL needs (commands do so themselves; --threads N limits all)"
+)
+
 
 def run(options: Devices) -> int:
     """Print the table."""
@@ -51,4 +57,5 @@ def run_doctor(options: Doctor) -> int:
     others = [device.info.index for device in report.devices if device.works]
     if others and not report.works:
         console.print(f"another one does: VESTCL_DEVICE={others[0]}")
+    console.print(Text(PROGRAMS), soft_wrap=True)
     return 0 if report.works else 1

@@ -4,6 +4,7 @@ Importing this module takes no time: whatever does is imported by `main`, which 
 """
 
 import sys
+import time
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType
@@ -56,9 +57,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: the command line; None takes the process's own.
     """
     from vestcl._version import __version__
-    from vestcl.cli import command_line
+    from vestcl.cli import threads
 
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:
+        threads.settle(given)
+    from vestcl.cli import command_line
+
     if given == ["--version"]:
         print(f"vestcl {__version__}")
         return 0
@@ -84,6 +89,17 @@ def _parsed_command(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
 
 
 def _run(command: Any) -> int:
+    from vestcl.cli import threads
+
+    threads.apply(getattr(command, "threads", None))
+    start, busy = time.perf_counter(), time.process_time()
+    status = _run_here(command)
+    if line := threads.slow_line(time.perf_counter() - start, time.process_time() - busy):
+        print(line, file=sys.stderr)
+    return status
+
+
+def _run_here(command: Any) -> int:
     if type(command).__name__ == "Demo":
         return _run_demo(command)
     module, function = _COMMANDS[type(command).__name__]
@@ -101,14 +117,20 @@ def _run_demo(options: "Demo") -> int:
 
 def _parsed_bench(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
     """As `_parsed_command`, of the bench that is asked for: one that can't be imported must not stop the others."""
-    from vestcl.cli import command_line
+    from vestcl.cli import command_line, threads
 
+    count, arguments = threads.asked_for(arguments), threads.without_option(arguments)
     names = arguments[1:2]
     benches = _benches(sorted({*names} & {*_BENCHES}), asked=True) or _benches([*_BENCHES], asked=False)
     kinds: dict[str, Callable[..., Any]] = {name: kind for name, (_, kind) in benches.items()}
     config = command_line.subcommand(kinds, "vestcl bench", arguments[1:])
     module = next(module for module, kind in benches.values() if type(config) is kind)
-    return config, lambda: int(module.main(config) or 0)
+
+    def measure() -> int:
+        threads.apply(count)
+        return int(module.main(config) or 0)
+
+    return config, measure
 
 
 def _benches(names: Sequence[str], asked: bool) -> dict[str, tuple[ModuleType, type]]:
