@@ -15,7 +15,10 @@ setup(
     # The kernels live beside the package in a checkout and inside it in a wheel; opencl.kernel_folder() knows both.
     packages=[*find_packages(include=["vestcl", "vestcl.*"]), "vestcl.kernels"],
     package_dir={"vestcl.kernels": "kernels"},
-    package_data={"vestcl": ["weights/*.safetensors"], "vestcl.kernels": ["*.cl", "*.h", "*/*.cl", "*/*.h"]},
+    package_data={
+        "vestcl": ["forecasting/*.html", "weights/*.safetensors"],
+        "vestcl.kernels": ["*.cl", "*.h", "*/*.cl", "*/*.h"],
+    },
     install_requires=[
         "av>=17.1",  # the newest for Python 3.10
         "huggingface_hub>=0.27",

@@ -79,7 +79,9 @@ def test_the_wheel_holds_every_kernel_and_module_and_nothing_else(wheel: Path, c
     assert kernels
     weights = {f"vestcl/{name}" for name in files(checkout / "vestcl", "*.safetensors")}
     assert WEIGHTS in weights
-    assert shipped == kernels | modules | weights
+    pages = {f"vestcl/{name}" for name in files(checkout / "vestcl", "*.html")}
+    assert "vestcl/forecasting/page.html" in pages
+    assert shipped == kernels | modules | weights | pages
 
 
 def test_both_versions_are_one(wheel: Path) -> None:

@@ -22,7 +22,7 @@ from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip
 from vestcl.evaluation import metrics
 from vestcl.evaluation.compare import FORECAST
-from vestcl.forecasting import baselines, geometric
+from vestcl.forecasting import baselines, geometric, page
 from vestcl.forecasting import files as forecast_files
 from vestcl.forecasting.geometric import Perception
 from vestcl.forecasting.geometric.forecast import METHOD as GEOMETRIC
@@ -103,9 +103,16 @@ def run(
         about = forecast_files.Details(f"street:{seed}", settings, scores, sheets)
         forecast_files.write_forecast(out, forecast, seen, index, views, about)
         write_pixels(out / "sheet.png", _sheet(perception, index, forecast, truth))
+        page.write_page(out, forecast, seen, index, views, truths=truth, scores=scores)
     console.print(_score_table(scores, forecast))
     console.print(_time_table(forecasts))
-    for path in (*(out / view.name for view in views), out / forecast_files.JSON, out / "sheet.png"):
+    for path in (
+        *(out / view.name for view in views),
+        out / forecast_files.JSON,
+        out / "sheet.png",
+        out / page.VIDEO,
+        out / page.PAGE,
+    ):
         console.print(str(path), soft_wrap=True, highlight=False)
 
 

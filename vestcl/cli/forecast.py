@@ -25,6 +25,7 @@ from vestcl.evaluation.compare import Comparison
 from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.forecasting import files as forecast_files
+from vestcl.forecasting import page
 from vestcl.forecasting.network.later_frames import LaterFrames, later_frames
 from vestcl.forecasting.result import Forecast, SkippedWork, View
 from vestcl.forecasting.sheets import forecast_sheet
@@ -113,6 +114,8 @@ def run(options: commands.Forecast) -> None:
             told = dataclasses.replace(forecast, seconds=dict(stages.clock.seconds))
             write = functools.partial(forecast_files.write_forecast, exr=options.exr, gif=options.gif, report=report)
             write(options.out, told, clip, index, views, details)
+            truths = {each.view: each.truth for each in comparisons}
+            page.write_page(options.out, forecast, clip, index, views, truths=truths, scores=details.scores)
     for comparison in comparisons:
         console.print(_score_table(comparison, later))
         if rival is not None and (line := where_another_is_better(comparison, forecast.method, rival.method)):
@@ -286,7 +289,8 @@ def _print_end(console: Console, saved: forecast_files.SavedForecast) -> None:
     for view in saved.about["views"].values():
         for path in _paths(view):
             console.print(Text(str(saved.folder / path)), soft_wrap=True)
-    console.print(Text(str(saved.folder / forecast_files.JSON)), soft_wrap=True)
+    for name in (forecast_files.JSON, page.VIDEO, page.PAGE):
+        console.print(Text(str(saved.folder / name)), soft_wrap=True)
 
 
 def _paths(view: dict[str, Any]) -> Iterator[Path]:

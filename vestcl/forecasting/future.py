@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
 from vestcl.forecasting.files import FPS, Details, video_images, write_forecast
+from vestcl.forecasting.page import write_page
 from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.forecasting.sheets import forecast_sheet
 from vestcl.io.contact_sheet import Picture
@@ -118,7 +119,8 @@ class Future(Mapping[str, FutureView]):
         return file.getvalue()
 
     def save(self, folder: str | Path, *, exr: bool = True, gif: bool = False) -> Path:
-        """Write what `vestcl forecast` writes: images, OpenEXR and a video per view, sheets, and forecast.json, last.
+        """Write what `vestcl forecast` writes: images, OpenEXR and a video per view, sheets, forecast.json, and a
+        page to look at (index.html).
 
         Args:
             folder: made if it is missing.
@@ -133,7 +135,9 @@ class Future(Mapping[str, FutureView]):
         """
         sheets = {name: self.sheet(name) for name in self}
         details = Details(self.clip.name, {"steps": self.steps, "views": list(self)}, None, sheets)
-        return write_forecast(folder, self.forecast, self.clip, self.index, self.views, details, exr=exr, gif=gif)
+        about = write_forecast(folder, self.forecast, self.clip, self.index, self.views, details, exr=exr, gif=gif)
+        write_page(folder, self.forecast, self.clip, self.index, self.views)
+        return about
 
     def video(self, path: str | Path, view: str | None = None) -> Path:
         """Write an MP4 (H.264) of one view at natural speed: in the source camera the frames seen, then the forecast.
