@@ -180,4 +180,4 @@ def _stacked(images: Sequence[tuple[str, NDArray[np.float32]]], label: str, colo
         pixels = rgb(image).copy()
         pixels[:_BAR] = colour
         rows.append([Cell(pixels, f"{name}: {label}")])
-    return sheet(rows)
+    return sheet(rows, cell_width=max(image.shape[2] for _, image in images))
