@@ -1,0 +1,334 @@
+"""The tables of the documentation, each from a JSON file that a command wrote: `make tables`.
+
+A page has a table between `<!-- table: NAME -->` and `<!-- /table -->`; `TABLES` lists the names. What is between the
+markers is replaced, all else stays.
+
+    python docs/tables.py                    write the tables of all pages
+    python docs/tables.py --check            exit status 1 if a page differs from the files
+    python docs/tables.py --keep FILE NAME   copy a bench's JSON to docs/results/NAME.json, paths reduced to names
+"""
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+DOCS: Final = ROOT / "docs"
+
+#: Steps that tables of forecasts show.
+STEPS: Final = (1, 3, 5)
+
+#: Metric -> its name in a table and its digits.
+METRICS: Final = {"psnr": ("PSNR", ".2f"), "ms_ssim": ("MS-SSIM", ".3f"), "st_lpips": ("ST-LPIPS", ".3f")}
+
+#: Keys of benches' files that are not kept: their means per clip are in "windows", too.
+_DROPPED: Final = ("clips",)
+
+#: What clips are called; others have their own name.
+CLIPS: Final = {
+    "highway.mp4": "motorway in California (highway.mp4)",
+    "motorway.mp4": "motorway (motorway.mp4)",
+    "kitti_odometry": "KITTI odometry 06",
+    "kitti_odometry_00": "KITTI odometry 00",
+    "kitti_clip": "KITTI raw, dense traffic (kitti_clip)",
+    "kitti_drive_0028": "KITTI raw, drive 0028",
+    "kitti_tracking_0006": "KITTI tracking 0006",
+    "street:": "procedural streets, held out",
+}
+
+#: What methods are called; others as the file has them.
+METHODS: Final = {
+    "optical flow": "constant-velocity flow extrapolation",
+    "optical flow, left camera": "constant-velocity flow extrapolation, left camera",
+    "optical flow, right camera's past (oracle)": "flow extrapolation of the right camera's past (oracle)",
+    "geometric, true poses": "geometric, oracle poses",
+}
+
+#: Columns of text, to the left.
+_LEFT: Final = ("method", "settings")
+
+#: Rows of the table of ablations.
+VARIANTS: Final = {
+    "full": "vest-s+from-rest",
+    "no-omf": "C: without object motion",
+    "no-emf": "B: without ego-motion",
+    "fixed-depth": "A: every pixel 20 m away",
+}
+
+_BLOCK: Final = re.compile(r"(?P<start><!-- table: (?P<name>[\w-]+) -->\n).*?(?P<end><!-- /table -->)", re.DOTALL)
+
+Row = Sequence[str]
+
+
+@dataclass(frozen=True)
+class Source:
+    """A JSON file of a bench, and the command that writes it."""
+
+    path: str
+    """From the repository's root."""
+    command: str
+
+    def read(self) -> dict[str, Any]:
+        """The file's content.
+
+        Raises:
+            ValueError: no such file, or no JSON object.
+        """
+        path = ROOT / self.path
+        if not path.is_file():
+            raise ValueError(f"{self.path}: no such file; `{self.command}` writes it")
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{self.path}: no JSON: {error}") from error
+        if not isinstance(content, dict):
+            raise ValueError(f"{self.path}: must be a JSON object, got {type(content).__name__}")
+        return content
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the documentation."""
+
+    sources: tuple[Source, ...]
+    rows: Callable[..., Iterator[Row]]
+    """Of the files' contents: the heading, then the rows."""
+
+    def markdown(self) -> str:
+        """The table, and a line with the commands and when and where they ran."""
+        contents = [source.read() for source in self.sources]
+        heading, *rows = self.rows(*contents)
+        lines = [_pipes(heading), _pipes(["---", *("---" if cell in _LEFT else "---:" for cell in heading[1:])]), *map(_pipes, rows), ""]
+        pairs = zip(self.sources, contents, strict=True)
+        lines += [f"<small>`{source.command}`; {_origin(content)}.</small>" for source, content in pairs]
+        return "\n".join(lines) + "\n"
+
+
+# ---------------------------------------------------------------- what tables contain
+
+
+def clips(view: str, metrics: Sequence[str] = tuple(METRICS)) -> Callable[[Mapping[str, Any]], Iterator[Row]]:
+    """A row per clip and method of one view, of `vestcl bench forecast --out`.
+
+    Args:
+        view: "source" or "right"; clips without it are left out.
+        metrics: of METRICS, joined by " / " in one cell per step.
+    """
+
+    def rows(content: Mapping[str, Any]) -> Iterator[Row]:
+        label = " / ".join(METRICS[metric][0] for metric in metrics)
+        yield ("clip", "windows", "method", *(f"{label}, t+{k}" for k in STEPS))
+        for group in content["inputs"]:
+            for number, (method, of) in enumerate(group["views"].get(view, {}).items()):
+                known = [metric for metric in metrics if metric in of["by_horizon"]]
+                cells = (_scores(of, known, k) for k in STEPS)
+                yield (_clip(group) if not number else "", str(of["windows"]) if not number else "", METHODS.get(method, method), *cells)
+
+    return rows
+
+
+def methods(view: str) -> Callable[[Mapping[str, Any]], Iterator[Row]]:
+    """A row per method of one view over all inputs that were pooled, of `vestcl bench forecast --pool --out`."""
+
+    def rows(content: Mapping[str, Any]) -> Iterator[Row]:
+        (group,) = content["inputs"]
+        found = group["views"][view]
+        yield ("PSNR / MS-SSIM / ST-LPIPS", *(f"t+{k}" for k in STEPS))
+        for method, of in found.items():
+            yield (METHODS.get(method, method), *(_scores(of, tuple(METRICS), k) for k in STEPS))
+
+    return rows
+
+
+def short(*contents: Mapping[str, Any]) -> Iterator[Row]:
+    """PSNR of optical flow and of the geometric forecast, a row per clip of several files of `vestcl bench forecast`."""
+    names = ("optical flow", "geometric")
+    yield ("PSNR, dB", *(f"{name}, t+{k}" for name in ("flow extrapolation", "geometric") for k in STEPS))
+    for group in (group for content in contents for group in content["inputs"]):
+        found = group["views"]["source"]
+        missing = [name for name in names if name not in found]
+        if missing:
+            raise ValueError(f"{group['input']}: has no method {', '.join(missing)}, only {', '.join(found)}")
+        yield (_clip(group), *(_scores(found[name], ("psnr",), k) for name in names for k in STEPS))
+
+
+def ablation(content: Mapping[str, Any]) -> Iterator[Row]:
+    """A row per variant, of `train.evaluate`."""
+    yield ("PSNR / SSIM / ST-LPIPS", *(f"t+{k}" for k in STEPS))
+    for name, label in VARIANTS.items():
+        of = content["summary"]["source"][name]["by_horizon"]
+        cells = (
+            f"{of['psnr'][k - 1]:.2f} / {of['ssim'][k - 1]:.3f} / {of['st_lpips'][k - 1]:.3f}" for k in STEPS
+        )  # fmt: skip
+        yield (label, *cells)
+
+
+def presets(content: Mapping[str, Any]) -> Iterator[Row]:
+    """A row per inference preset, of `vestcl bench pareto`."""
+    front = content["devices"][0]["details"]["front"]
+    points = {point["value"]: point for point in front["points"]}
+    exact = points[front["qualities"]["exact"]]
+    yield ("preset", "ms/step", "delta PSNR at t+1 against `exact`, dB", "MS-SSIM", "settings")
+    for name, value in front["qualities"].items():
+        point = points[value]
+        delta = point["psnr"]["median"] - exact["psnr"]["median"]
+        time, quality = f"{point['seconds']['median'] * 1e3:.0f}", f"{point['ms_ssim']['median']:.3f}"
+        yield (f"`{name}`", time, f"{delta:+.2f}" if delta else "0", quality, "" if value == name else value)
+
+
+def skipping(content: Mapping[str, Any]) -> Iterator[Row]:
+    """A row per scene, of `vestcl bench pipeline`."""
+    yield ("scene", "foreground", "nothing skipped, ms", "skipped, ms", "saved", "of DMVFN's time")
+    for name, scene in content["devices"][0]["details"]["scenes"].items():
+        seconds, saved = scene["seconds"], scene["saved_share"]["all skipped"]["median"]
+        before, after = (f"{seconds[key]['median'] * 1e3:.0f}" for key in ("nothing skipped", "all skipped"))
+        label = "worst case" if name == "everything" else name
+        yield (label, f"{scene['foreground']:.0%}", before, after, f"{saved:.0%}", f"{scene['of_peer']['median']:.2f}")
+
+
+def splatting(content: Mapping[str, Any]) -> Iterator[Row]:
+    """A row per radius, of `vestcl bench splat`."""
+    yield ("radius, px", "fragments", "forward", "forward + backward", "scratch memory, x features")
+    (details,) = (device["details"] for device in content["devices"])
+    memory = {found["radius"]: found for found in details["memory"]}
+    for found in details["speed"]:
+        facts = found["facts"]
+        cells = (_time(found, key) for key in ("forward", "both"))
+        scratch = memory[facts["radius"]]["scratch"] / memory[facts["radius"]]["features"]
+        yield (f"{facts['radius']:g}", f"{facts['fragments']:,}", *cells, f"{scratch:.2f}")
+
+
+# ---------------------------------------------------------------- the tables
+
+FORECAST: Final = Source(
+    "docs/results/forecast.json", "vestcl bench forecast CLIP ... --windows docs/windows.json --st-lpips FILE"
+)
+STREETS: Final = Source(
+    "docs/results/streets.json", "vestcl bench forecast street: --pool --first 2 --last 2 --model vest-s --st-lpips FILE"
+)
+ABLATION: Final = Source(
+    "docs/results/ablation.json",
+    "python -m train.evaluate street --height 128 --width 416 --seeds 1100 1119 --st-lpips FILE",
+)
+PARETO: Final = Source("docs/time_against_error/pareto.json", "vestcl bench pareto")
+PIPELINE: Final = Source("docs/time_against_error/pipeline.json", "vestcl bench pipeline")
+
+TABLES: Final = {
+    "accuracy": Table((STREETS, FORECAST), short),
+    "forecast-source": Table((FORECAST,), clips("source")),
+    "forecast-right": Table((FORECAST,), clips("right")),
+    "streets-source": Table((STREETS,), methods("source")),
+    "streets-right": Table((STREETS,), methods("right")),
+    "ablation": Table((ABLATION,), ablation),
+    "presets": Table((PARETO,), presets),
+    "skipping": Table((PIPELINE,), skipping),
+}
+
+
+def pages() -> list[Path]:
+    """README.md and all Markdown of docs/."""
+    return [ROOT / "README.md", *sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts)]
+
+
+def filled(text: str) -> str:
+    """A page's text with its tables from the files.
+
+    Raises:
+        ValueError: a table that `TABLES` does not have, or that has no file.
+    """
+
+    def replaced(match: re.Match[str]) -> str:
+        name = match["name"]
+        if name not in TABLES:
+            raise ValueError(f"table {name!r} must be one of {', '.join(TABLES)}")
+        return f"{match['start']}{TABLES[name].markdown()}{match['end']}"
+
+    return _BLOCK.sub(replaced, text)
+
+
+def stale() -> list[Path]:
+    """Pages whose tables differ from the files."""
+    texts = ((page, page.read_text(encoding="utf-8")) for page in pages())
+    return [page for page, text in texts if filled(text) != text]
+
+
+def keep(file: Path, name: str) -> Path:
+    """Copy a bench's JSON to docs/results; of paths, which are of one machine, only names stay.
+
+    Raises:
+        ValueError: the file can't be read or is no JSON.
+    """
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{file}: can't be read as JSON: {error}") from error
+    kept = DOCS / "results" / f"{name}.json"
+    kept.write_text(json.dumps(_named(content), separators=(",", ":")) + "\n", encoding="utf-8")
+    return kept
+
+
+def main() -> int:
+    """Write, check or keep; the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing; exit status 1 if a page is stale")
+    parser.add_argument("--keep", nargs=2, metavar=("FILE", "NAME"), help="copy a bench's JSON to docs/results")
+    options = parser.parse_args()
+    try:
+        if options.keep:
+            print(f"wrote {keep(Path(options.keep[0]), options.keep[1]).relative_to(ROOT)}")
+        found = stale()
+        for page in found:
+            print(f"{page.relative_to(ROOT)}: {'is stale, run `make tables`' if options.check else 'written'}")
+            if not options.check:
+                page.write_text(filled(page.read_text(encoding="utf-8")), encoding="utf-8")
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return int(options.check and bool(found))
+
+
+def _named(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _named(item) for key, item in value.items() if key not in _DROPPED}
+    if isinstance(value, list):
+        return [_named(item) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    return Path(value).name if isinstance(value, str) and value.startswith("/") else value
+
+
+def _clip(group: Mapping[str, Any]) -> str:
+    name = CLIPS.get(str(group["input"]), str(group["input"]))
+    return f"{name} ({group['use']})" if group.get("use") else name
+
+
+def _scores(of: Mapping[str, Any], metrics: Sequence[str], step: int) -> str:
+    """ "24.79 / 0.932"; "-" of a step that was not measured."""
+    found = ((of["by_horizon"].get(metric), METRICS[metric][1]) for metric in metrics)
+    return " / ".join(
+        "-" if values is None or step > len(values) or values[step - 1] is None else f"{values[step - 1]:{digits}}"
+        for values, digits in found
+    )
+
+
+def _time(found: Mapping[str, Any], key: str) -> str:
+    return f"{found['seconds'][key]['median'] * 1e3:.1f} ms, {found['of_copy'][key]['median']:.1f}x memcpy time"
+
+
+def _origin(content: Mapping[str, Any]) -> str:
+    """ "vestcl 0.1.0, 2026-12-01, AMD EPYC, 2 cores"."""
+    machine = content["machine"] if "machine" in content else content["devices"][0]["machine"]
+    return f"vestcl {machine['vestcl']}, {machine['date'][:10]}, {machine['processor']}, {machine['cores']} cores"
+
+
+def _pipes(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
