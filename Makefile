@@ -8,7 +8,7 @@ OUT ?= out
 TEST_PROCESSES ?= 2
 PYTEST_OPTIONS := -q -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
-.PHONY: venv demo test lint test-lowest bench stress oclgrind devices-test clean
+.PHONY: venv demo test lint test-lowest bench stress oclgrind devices-test docs tables clean
 
 venv: .venv/.installed
 
@@ -65,6 +65,19 @@ devices-test: venv
 oclgrind: venv
 	$(BIN)/python tests/support/oclgrind_scenes.py
 
+# docs/_build/html/index.html: warnings are errors, and the examples of the pages run.
+docs: .venv/.docs-installed
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+	$(BIN)/sphinx-build -W --keep-going -q -b doctest docs docs/_build/doctest
+
+.venv/.docs-installed: .venv/.installed
+	$(BIN)/python -m pip install --constraint constraints.txt furo myst-nb sphinx
+	touch $@
+
+# The tables of README.md and docs/, from the JSON files of docs/results.
+tables: venv
+	$(BIN)/python docs/tables.py
+
 clean:
-	rm -rf .venv $(LOWEST) build dist ./*.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	rm -rf .venv $(LOWEST) build dist docs/_build docs/notebooks ./*.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
