@@ -25,7 +25,7 @@ demo: venv
 lint: venv
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy vestcl train
+	$(BIN)/mypy vestcl train docs
 
 # torch's OpenMP workers would spin on the cores that OpenCL's threads need, and there is a process a core.
 test: lint

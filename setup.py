@@ -1,6 +1,14 @@
 """What pip needs to know about vestcl. Versions are ranges here; constraints.txt has the exact ones that are tested."""
 
+from pathlib import Path
+
 from setuptools import find_packages, setup
+
+#: The page of the package index; pictures and pages that it links to are in the repository only.
+README = Path(__file__).with_name("README.md")
+
+#: Of docs/, the site that `make docs` builds.
+DOCS = ["furo>=2024.8", "myst-nb>=1.1", "sphinx>=8"]
 
 #: Of train/, which is not part of the package.
 TRAIN = ["huggingface_hub>=0.34", "Jinja2>=3.1", "pydantic>=2.7", "PyYAML>=6", "tensorboard>=2.16.2"]
@@ -9,6 +17,18 @@ setup(
     name="vestcl",
     version="0.1.0",
     description="Differentiable point splatting in OpenCL for PyTorch, and forecasts of driving video from new views",
+    long_description=README.read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    project_urls={"Paper": "https://skrya.github.io/projects/ffn-dsr"},
+    classifiers=[  # only what was tried
+        "Development Status :: 3 - Alpha",
+        "Intended Audience :: Science/Research",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3",
+        "Programming Language :: Python :: 3.11",
+        "Topic :: Scientific/Engineering :: Image Processing",
+        "Typing :: Typed",
+    ],
     license="Apache-2.0",
     license_files=["LICENSE"],
     python_requires=">=3.10",
@@ -51,6 +71,7 @@ setup(
             "setuptools>=77",
             "types-PyYAML>=6",
         ],
+        "docs": DOCS,
         "estimators": ["transformers>=4.57.1"],
         "intel": ["intel-cmplr-lib-rt", "intel-opencl-rt"],
         "train": TRAIN,

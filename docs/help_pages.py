@@ -58,7 +58,8 @@ def _script(name: str) -> Callable[[Sequence[str]], object]:
     module = importlib.import_module(f"train.{name}")
     if not hasattr(module, "main"):
         module = importlib.import_module(f"train.{name}.__main__")
-    return module.main  # type: ignore[no-any-return]
+    main: Callable[[Sequence[str]], object] = module.main
+    return main
 
 
 def _subcommands(text: str) -> list[str]:

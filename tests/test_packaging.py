@@ -38,7 +38,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("tests", "train"):  # must stay out of the wheel
         (folder / name).mkdir()
         (folder / name / "__init__.py").touch()
-    for name in ("setup.py", "pyproject.toml", "LICENSE"):
+    for name in ("setup.py", "pyproject.toml", "LICENSE", "README.md"):
         shutil.copy(ROOT / name, folder)
     return folder
 

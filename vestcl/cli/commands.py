@@ -40,7 +40,7 @@ class Demo:
     """Pixels."""
     width: int = 832
     """Pixels."""
-    seed: int = 0
+    seed: int = 3
     """Which street."""
     model: str | None = None
     """vest-s, a .safetensors file, a checkpoint's folder, or geometric. Without it: vest-s, where it is installed."""

@@ -1,0 +1,145 @@
+"""docs/tables.py: the pages' tables are those of the JSON files, and what the script does with other files."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+MACHINE = {"vestcl": "0.1.0", "date": "2026-12-01T08:00:00+00:00", "processor": "A CPU", "cores": "2"}
+
+
+def load() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("docs_tables", ROOT / "docs" / "tables.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["docs_tables"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+tables = load()
+
+
+def method(*psnr: float, windows: int = 2, **more: list[float | None]) -> dict[str, Any]:
+    return {"windows": windows, "by_horizon": {"psnr": list(psnr), **more}}
+
+
+def bench(**methods: dict[str, Any]) -> dict[str, Any]:
+    """A file of `vestcl bench forecast` with one clip."""
+    group = {"input": "/data/highway.mp4", "use": "checked", "views": {"source": methods}}
+    return {"machine": MACHINE, "config": {}, "inputs": [group]}
+
+
+def test_the_pages_are_those_of_the_files() -> None:
+    """`make tables` after a bench; no figure is edited by hand."""
+    assert [page.relative_to(ROOT).as_posix() for page in tables.stale()] == []
+
+
+def test_every_table_is_shown_and_every_marker_is_closed() -> None:
+    text = "".join(page.read_text(encoding="utf-8") for page in tables.pages())
+    shown = {match["name"] for match in tables._BLOCK.finditer(text)}
+    waiting = {name for name, table in tables.TABLES.items() if not all((ROOT / s.path).is_file() for s in table.sources)}
+    assert shown == set(tables.TABLES) - waiting
+    assert text.count("<!-- table: ") == len(list(tables._BLOCK.finditer(text))) == text.count("<!-- /table -->")
+
+
+def test_no_file_has_a_path_of_a_machine() -> None:
+    for file in (ROOT / "docs" / "results").glob("*.json"):
+        assert '"/' not in file.read_text(encoding="utf-8"), file.name
+
+
+def test_a_row_by_hand() -> None:
+    """Steps 1, 3 and 5; a metric that was not measured, and a step beyond the last, are "-"."""
+    content = bench(
+        **{
+            "optical flow": method(30, 29, 28, 27, 26, ms_ssim=[0.9, 0.8, 0.7, 0.6, None]),
+            "geometric": method(31.006, 30, 29.5),
+        }
+    )
+    heading, *rows = tables.clips("source", ("psnr", "ms_ssim"))(content)
+    assert heading == ("clip", "windows", "method", *(f"PSNR / MS-SSIM, t+{k}" for k in (1, 3, 5)))
+    assert rows == [
+        (
+            "/data/highway.mp4 (checked)", "2", "constant-velocity flow extrapolation",
+            "30.00 / 0.900", "28.00 / 0.700", "26.00 / -",
+        ),
+        ("", "", "geometric", "31.01", "29.50", "-"),
+    ]  # fmt: skip
+
+
+def test_presets_by_hand() -> None:
+    def point(value: str, ms: float, psnr: float) -> dict[str, Any]:
+        return {
+            "value": value, "seconds": {"median": ms / 1e3}, "psnr": {"median": psnr}, "ms_ssim": {"median": 0.9579}
+        }  # fmt: skip
+
+    front = {
+        "points": [point("exact", 211, 25.8), point("blocks 2", 131.4, 25.9)],
+        "qualities": {"exact": "exact", "balanced": "blocks 2"},
+    }
+    _, *rows = tables.presets({"devices": [{"details": {"front": front}}]})
+    assert rows == [("`exact`", "211", "0", "0.958", ""), ("`balanced`", "131", "+0.10", "0.958", "blocks 2")]
+
+
+def test_splatting_by_hand() -> None:
+    def timed(ms: float, copies: float) -> dict[str, Any]:
+        return {"time": {"median": ms / 1e3}, "copies": {"spread": {"median": copies}}}
+
+    facts = {"radius": 1.0, "fragments": 547540}
+    details = {
+        "speed": [{"facts": facts, "forward": timed(7.4, 3.5), "both": timed(14.21, 3.2)}],
+        "memory": [{"radius": 1.0, "ratio": 0.336}],
+    }
+    _, row = tables.splatting({"devices": [{"details": details}]})
+    assert row == ("1", "547,540", "7.4 ms, 3.5x memcpy time", "14.2 ms, 3.2x memcpy time", "0.34")
+
+
+def test_keep_reduces_paths_to_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "DOCS", tmp_path)
+    (tmp_path / "results").mkdir()
+    file = tmp_path / "real.json"
+    file.write_text(json.dumps(bench(geometric=method(31.0062891)) | {"clips": {"street 1": 2}}))
+    kept = json.loads(tables.keep(file, "forecast").read_text())
+    assert kept["inputs"][0]["input"] == "highway.mp4"
+    assert kept["inputs"][0]["views"]["source"]["geometric"]["by_horizon"]["psnr"] == [31.0063]
+    assert "clips" not in kept
+
+
+def test_a_page_keeps_the_rest_of_its_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "ROOT", tmp_path)
+    (tmp_path / "a.json").write_text(json.dumps(bench(geometric=method(31.0))))
+    source = tables.Source("a.json", "vestcl bench forecast CLIP")
+    monkeypatch.setattr(tables, "TABLES", {"a": tables.Table((source,), tables.clips("source", ("psnr",)))})
+    text = tables.filled("before\n<!-- table: a -->\nold\n<!-- /table -->\nafter\n")
+    assert text.startswith("before\n<!-- table: a -->\n| clip | ") and text.endswith("\n<!-- /table -->\nafter\n")
+    assert "| 31.00 |" in text and "old" not in text
+    assert "`vestcl bench forecast CLIP`; vestcl 0.1.0, 2026-12-01, A CPU, 2 cores." in text
+    assert tables.filled(text) == text
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "a.json: no such file; `vestcl bench x` writes it"),
+        ("{", "a.json: no JSON"),
+        ("[]", "must be a JSON"),
+    ],
+)
+def test_a_file_that_is_none_is_named(
+    content: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "ROOT", tmp_path)
+    if content is not None:
+        (tmp_path / "a.json").write_text(content)
+    with pytest.raises(ValueError, match=message):
+        tables.Source("a.json", "vestcl bench x").read()
+
+
+def test_an_unknown_table_is_refused() -> None:
+    with pytest.raises(ValueError, match="'speed' must be one of accuracy, "):
+        tables.filled("<!-- table: speed -->\n<!-- /table -->")
