@@ -71,7 +71,7 @@ docs: .venv/.docs-installed
 	$(BIN)/sphinx-build -W --keep-going -q -b doctest docs docs/_build/doctest
 
 .venv/.docs-installed: .venv/.installed
-	$(BIN)/python -m pip install --constraint constraints.txt furo myst-nb sphinx
+	$(BIN)/python -m pip install --constraint constraints.txt --no-build-isolation --editable '.[docs]'
 	touch $@
 
 # The tables of README.md and docs/, from the JSON files of docs/results.

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 #: Columns of the help in the pages.
-WIDTH: Final = 96
+WIDTH: Final = 86
 
 _ESCAPES: Final = re.compile(r"\x1b\[[\d;]*m")
 

@@ -1,7 +1,7 @@
 """Write docs/street.webp: frames seen, forecast and truth of a procedural street, as an animation.
 
 `python docs/street.py` makes it again; `python docs/street.py --rank` lists streets by PSNR at t+3, to choose the
-median one, for the animation shows what is usual and not the best.
+median one, so that the animation is representative, not the best.
 """
 
 import argparse
