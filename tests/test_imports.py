@@ -23,7 +23,7 @@ ORDER = (
     ("models", "prepare"),
     ("forecasting",),
     ("evaluation",),
-    ("doctor", "bench", "viewer", "cli"),
+    ("doctor", "bench", "viewer", "cli", "__main__"),
 )
 LEVELS = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
 

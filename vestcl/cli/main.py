@@ -83,7 +83,10 @@ def _parsed_command(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
         "demo": commands.Demo,
         "bench": commands.Bench,
     }
-    about = "Forecasts of driving video from new views, in OpenCL. `vestcl --version` prints the version."
+    about = (
+        "Forecasts of driving video from new views, in OpenCL. `vestcl --version` prints the version, "
+        "`vestcl --tyro-print-completion bash` (zsh, tcsh) a script that completes its options."
+    )
     command = command_line.subcommand(kinds, "vestcl", arguments, about)
     return command, lambda: _run(command)
 
