@@ -109,9 +109,9 @@ class Table:
             *map(_pipes, rows),
             "",
         ]
-        pairs = zip(self.sources, contents, strict=True)
-        lines += [f"<small>`{source.command}`; {_origin(content)}.</small>" for source, content in pairs]
-        return "\n".join(lines) + "\n"
+        for source, content in zip(self.sources, contents, strict=True):
+            lines += [f"<small>`{source.command}`; {_origin(content)}.</small>", ""]
+        return "\n".join(lines[:-1]) + "\n"
 
 
 # ---------------------------------------------------------------- what tables contain
@@ -148,7 +148,8 @@ def methods(view: str) -> Callable[[Mapping[str, Any]], Iterator[Row]]:
     def rows(content: Mapping[str, Any]) -> Iterator[Row]:
         (group,) = content["inputs"]
         found = group["views"][view]
-        yield ("PSNR / MS-SSIM / ST-LPIPS", *(f"t+{k}" for k in STEPS))
+        count = max(of["windows"] for of in found.values())
+        yield (f"PSNR / MS-SSIM / ST-LPIPS, {count} windows", *(f"t+{k}" for k in STEPS))
         for method, of in found.items():
             yield (METHODS.get(method, method), *(_scores(of, tuple(METRICS), k) for k in STEPS))
 

@@ -71,7 +71,7 @@ def test_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     assert cli.main(["demo", *options.split(), last]) == 0
     assert cli.main(["demo", "--model", "geometric"]) == 0
     usual, given, geometric = calls
-    assert usual == (Path("out"), 256, 832, 0, None, "balanced", before.info.index)
+    assert usual == (Path("out"), 256, 832, 3, None, "balanced", before.info.index)
     assert given == (Path("x"), 8, 9, 3, None, "fast", last)
     assert geometric[4] == "geometric"
     assert opencl.current() is before
