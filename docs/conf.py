@@ -71,6 +71,11 @@ def page_text(_app: Any, name: str, source: list[str]) -> None:
     source[0] = _NOTEBOOK_LINK.sub(rf"]({depth}notebooks/\1.ipynb)", text)
 
 
+def always_read(*_of_the_build: Any) -> list[str]:
+    """Generated pages, whose sources Sphinx does not watch."""
+    return list(GENERATED)
+
+
 def docstring(_app: Any, _what: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
     """Formulas of docstrings are plain text, indented ones as they are written."""
     shown, formula = list[str](), False
@@ -97,6 +102,7 @@ def copy_notebooks(_app: Any) -> None:
 def setup(app: Any) -> None:
     """Connect the above."""
     app.connect("builder-inited", copy_notebooks)
+    app.connect("env-get-outdated", always_read)
     app.connect("source-read", page_text)
     app.connect("autodoc-process-docstring", docstring, priority=100)
 

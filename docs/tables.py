@@ -127,17 +127,12 @@ def clips(view: str, metrics: Sequence[str] = tuple(METRICS)) -> Callable[[Mappi
 
     def rows(content: Mapping[str, Any]) -> Iterator[Row]:
         label = " / ".join(METRICS[metric][0] for metric in metrics)
-        yield ("clip", "windows", "method", *(f"{label}, t+{k}" for k in STEPS))
+        yield (f"{label}; windows", "method", *(f"t+{k}" for k in STEPS))
         for group in content["inputs"]:
             for number, (method, of) in enumerate(group["views"].get(view, {}).items()):
                 known = [metric for metric in metrics if metric in of["by_horizon"]]
-                cells = (_scores(of, known, k) for k in STEPS)
-                yield (
-                    _clip(group) if not number else "",
-                    str(of["windows"]) if not number else "",
-                    METHODS.get(method, method),
-                    *cells,
-                )
+                first = "" if number else f"{_clip(group)}; {of['windows']}"
+                yield (first, METHODS.get(method, method), *(_scores(of, known, k) for k in STEPS))
 
     return rows
 

@@ -65,14 +65,12 @@ def test_a_row_by_hand() -> None:
         }
     )
     heading, *rows = tables.clips("source", ("psnr", "ms_ssim"))(content)
-    assert heading == ("clip", "windows", "method", *(f"PSNR / MS-SSIM, t+{k}" for k in (1, 3, 5)))
+    assert heading == ("PSNR / MS-SSIM; windows", "method", "t+1", "t+3", "t+5")
+    flow = ("30.00 / 0.900", "28.00 / 0.700", "26.00 / -")
     assert rows == [
-        (
-            "/data/highway.mp4 (checked)", "2", "constant-velocity flow extrapolation",
-            "30.00 / 0.900", "28.00 / 0.700", "26.00 / -",
-        ),
-        ("", "", "geometric", "31.01", "29.50", "-"),
-    ]  # fmt: skip
+        ("/data/highway.mp4 (checked); 2", "constant-velocity flow extrapolation", *flow),
+        ("", "geometric", "31.01", "29.50", "-"),
+    ]
 
 
 def test_presets_by_hand() -> None:
@@ -119,7 +117,9 @@ def test_a_page_keeps_the_rest_of_its_text(tmp_path: Path, monkeypatch: pytest.M
     source = tables.Source("a.json", "vestcl bench forecast CLIP")
     monkeypatch.setattr(tables, "TABLES", {"a": tables.Table((source,), tables.clips("source", ("psnr",)))})
     text = tables.filled("before\n<!-- table: a -->\nold\n<!-- /table -->\nafter\n")
-    assert text.startswith("before\n<!-- table: a -->\n| clip | ") and text.endswith("\n<!-- /table -->\nafter\n")
+    assert text.startswith("before\n<!-- table: a -->\n| PSNR; windows | ") and text.endswith(
+        "\n<!-- /table -->\nafter\n"
+    )
     assert "| 31.00 |" in text and "old" not in text
     assert "`vestcl bench forecast CLIP`; vestcl 0.1.0, 2026-12-01, A CPU, 2 cores." in text
     assert tables.filled(text) == text
