@@ -32,6 +32,9 @@ extensions = [
 ]
 exclude_patterns = ["_build"]
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["tables.css"]
+highlight_language = "none"  # blocks without a language are formulas and listings
 html_title = f"vestcl {version}"
 
 nb_execution_mode = "off"  # the tests run the notebooks; the pages show what they printed

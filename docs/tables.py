@@ -49,6 +49,16 @@ METHODS: Final = {
     "geometric, true poses": "geometric, oracle poses",
 }
 
+#: Facts of forecasts besides images -> their row and digits; of those only what a file has.
+FACTS: Final = {
+    "rotation_deg": ("rotation error of the camera, deg", ".3f"),
+    "translation_percent": ("translation error of the camera, %", ".2f"),
+    "motion_m": ("3D motion, mean error, m", ".3f"),
+    "moving_m": ("3D motion of dynamic objects, mean error, m", ".3f"),
+    "splatted_db": ("depth, motion and background true, splatted: PSNR, dB", ".2f"),
+    "warped_db": ("the same, warped back: PSNR, dB", ".2f"),
+}
+
 #: Columns of text, to the left.
 _LEFT: Final = ("method", "settings")
 
@@ -151,6 +161,15 @@ def methods(view: str) -> Callable[[Mapping[str, Any]], Iterator[Row]]:
     return rows
 
 
+def facts(content: Mapping[str, Any]) -> Iterator[Row]:
+    """A row per fact besides images of the geometric forecast, of `vestcl bench forecast --pool --out`."""
+    (group,) = content["inputs"]
+    yield ("geometric forecast against the true motion", *(f"t+{k}" for k in STEPS))
+    for name, (label, digits) in FACTS.items():
+        if name in group["facts"]:
+            yield (label, *(_number(group["facts"][name], k, digits) for k in STEPS))
+
+
 def short(*contents: Mapping[str, Any]) -> Iterator[Row]:
     """PSNR of flow extrapolation and the geometric forecast, a row per clip of files of `vestcl bench forecast`."""
     names = ("optical flow", "geometric")
@@ -237,6 +256,7 @@ TABLES: Final = {
     "forecast-right": Table((FORECAST,), clips("right")),
     "streets-source": Table((STREETS,), methods("source")),
     "streets-right": Table((STREETS,), methods("right")),
+    "streets-facts": Table((STREETS,), facts),
     "ablation": Table((ABLATION,), ablation),
     "speed": Table((PARETO,), speed),
     "presets": Table((PARETO,), presets),
@@ -324,11 +344,13 @@ def _clip(group: Mapping[str, Any]) -> str:
 
 def _scores(of: Mapping[str, Any], metrics: Sequence[str], step: int) -> str:
     """ "24.79 / 0.932"; "-" of a step that was not measured."""
-    found = ((of["by_horizon"].get(metric), METRICS[metric][1]) for metric in metrics)
-    return " / ".join(
-        "-" if values is None or step > len(values) or values[step - 1] is None else f"{values[step - 1]:{digits}}"
-        for values, digits in found
-    )
+    found = ((of["by_horizon"].get(metric, ()), METRICS[metric][1]) for metric in metrics)
+    return " / ".join(_number(values, step, digits) for values, digits in found)
+
+
+def _number(values: Sequence[float | None], step: int, digits: str) -> str:
+    value = values[step - 1] if step <= len(values) else None
+    return "-" if value is None else f"{value:{digits}}"
 
 
 def _time(found: Mapping[str, Any]) -> str:

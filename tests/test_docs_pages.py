@@ -97,6 +97,27 @@ def test_the_reference_lists_every_command(monkeypatch: pytest.MonkeyPatch) -> N
     assert "--compare" in text and "\x1b" not in text and not re.search(r" $", text, re.MULTILINE)
 
 
+def test_links_to_source_files_stay_as_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    import conf
+
+    page = ["[`a.py:A`](../vestcl/a.py), [notebook 03](../../notebooks/03_training.ipynb), [memory](../memory.md)"]
+    conf.page_text(None, "guides/train", page)
+    assert page == ["`a.py:A`, [notebook 03](../notebooks/03_training.ipynb), [memory](../memory.md)"]
+    conventions = [""]
+    conf.page_text(None, "concepts/conventions", conventions)
+    assert "(../paper.md)" in conventions[0] and conventions[0].startswith("# Conventions")
+
+
+def test_formulas_of_docstrings_are_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    import conf
+
+    lines = ["Of |x| * y.", "", "    a_i = |p - q|", "", "Args:", "    x_: px."]
+    conf.docstring(None, "function", "f", None, None, lines)
+    assert lines == ["Of \\|x\\| \\* y.", "", "::", "", "    a_i = |p - q|", "", "Args:", "    x\\_: px."]
+
+
 def test_python_m_vestcl() -> None:
     """The module is there, and is the command."""
     text = (ROOT / "vestcl" / "__main__.py").read_text(encoding="utf-8")
