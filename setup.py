@@ -27,7 +27,6 @@ setup(
         "Programming Language :: Python :: 3",
         "Programming Language :: Python :: 3.11",
         "Topic :: Scientific/Engineering :: Image Processing",
-        "Typing :: Typed",
     ],
     license="Apache-2.0",
     license_files=["LICENSE"],

@@ -21,7 +21,7 @@ with exit status 2.
 
 ## Shell completion
 
-`vestcl --tyro-print-completion SHELL` prints a completion script for `bash`, `zsh` or `tcsh`; for bash:
+`vestcl --tyro-print-completion SHELL` prints a completion script for `bash` or `zsh`; for bash:
 
 ```sh
 mkdir -p ~/.local/share/bash-completion/completions

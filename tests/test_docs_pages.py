@@ -118,6 +118,14 @@ def test_formulas_of_docstrings_are_no_markup(monkeypatch: pytest.MonkeyPatch) -
     assert lines == ["Of \\|x\\| \\* y.", "", "::", "", "    a_i = |p - q|", "", "Args:", "    x\\_: px."]
 
 
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completion_scripts(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["--tyro-print-completion", shell])
+    script = capsys.readouterr().out
+    assert not caught.value.code and "forecast" in script and "bench" in script
+
+
 def test_python_m_vestcl() -> None:
     """The module is there, and is the command."""
     text = (ROOT / "vestcl" / "__main__.py").read_text(encoding="utf-8")

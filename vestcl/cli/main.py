@@ -85,7 +85,7 @@ def _parsed_command(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
     }
     about = (
         "Forecasts of driving video from new views, in OpenCL. `vestcl --version` prints the version, "
-        "`vestcl --tyro-print-completion bash` (zsh, tcsh) a script that completes its options."
+        "`vestcl --tyro-print-completion bash` (or zsh) a script that completes its options."
     )
     command = command_line.subcommand(kinds, "vestcl", arguments, about)
     return command, lambda: _run(command)
