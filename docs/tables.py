@@ -173,13 +173,14 @@ def facts(content: Mapping[str, Any]) -> Iterator[Row]:
 def short(*contents: Mapping[str, Any]) -> Iterator[Row]:
     """PSNR of flow extrapolation and the geometric forecast, a row per clip of files of `vestcl bench forecast`."""
     names = ("optical flow", "geometric")
-    yield ("PSNR, dB", *(f"{name}, t+{k}" for name in ("flow extrapolation", "geometric") for k in STEPS))
+    yield ("PSNR, dB; windows", *(f"{name}, t+{k}" for name in ("flow extrapolation", "geometric") for k in STEPS))
     for group in (group for content in contents for group in content["inputs"]):
         found = group["views"]["source"]
         missing = [name for name in names if name not in found]
         if missing:
             raise ValueError(f"{group['input']}: has no method {', '.join(missing)}, only {', '.join(found)}")
-        yield (_clip(group), *(_scores(found[name], ("psnr",), k) for name in names for k in STEPS))
+        label = f"{_clip(group)}; {found[names[0]]['windows']}"
+        yield (label, *(_scores(found[name], ("psnr",), k) for name in names for k in STEPS))
 
 
 def ablation(content: Mapping[str, Any]) -> Iterator[Row]:
