@@ -59,6 +59,9 @@ FACTS: Final = {
     "warped_db": ("the same, warped back: PSNR, dB", ".2f"),
 }
 
+#: Distance of an opacity from 1 -> how a table shows the opacity.
+OPACITIES: Final = {1e-3: "0.999", 1e-6: "1 - 1e-6", 0: "1"}
+
 #: Columns of text, to the left.
 _LEFT: Final = ("method", "settings")
 
@@ -234,6 +237,17 @@ def splatting(content: Mapping[str, Any]) -> Iterator[Row]:
         yield (f"{facts['radius']:g}", f"{facts['fragments']:,}", *cells, f"{memory[facts['radius']]:.2f}")
 
 
+def opacities(content: Mapping[str, Any]) -> Iterator[Row]:
+    """A row per opacity close to 1, worst errors of image and gradients, of `vestcl bench stability`."""
+    peers = {"dividing": "dividing by 1 - alpha + 1e-9", "clamping": "alpha at most 0.99, T by division"}
+    yield ("float32 against float64, image / gradient", "vestcl", *peers.values())
+    for row in content["devices"][0]["details"]["rows"]:
+        if row["family"] == "opacity" and row["knob"] in OPACITIES:
+            found = [row["errors"], *(row["peers"][name] for name in peers)]
+            cells = (f"{_worst(of['outputs'])} / {_worst(of['gradients'])}" for of in found)
+            yield (f"opacity {OPACITIES[row['knob']]}", *cells)
+
+
 # ---------------------------------------------------------------- the tables
 
 FORECAST: Final = Source(
@@ -248,6 +262,7 @@ ABLATION: Final = Source(
     "python -m train.evaluate street --height 128 --width 416 --seeds 1100 1119 --st-lpips FILE",
 )
 SPLAT: Final = Source("docs/results/splat.json", "vestcl bench splat")
+STABILITY: Final = Source("docs/results/stability.json", "vestcl bench stability")
 PARETO: Final = Source("docs/time_against_error/pareto.json", "vestcl bench pareto")
 PIPELINE: Final = Source("docs/time_against_error/pipeline.json", "vestcl bench pipeline")
 
@@ -262,6 +277,7 @@ TABLES: Final = {
     "speed": Table((PARETO,), speed),
     "presets": Table((PARETO,), presets),
     "splat": Table((SPLAT,), splatting),
+    "opacities": Table((STABILITY,), opacities),
     "skipping": Table((PIPELINE,), skipping),
 }
 
@@ -347,6 +363,10 @@ def _scores(of: Mapping[str, Any], metrics: Sequence[str], step: int) -> str:
     """ "24.79 / 0.932"; "-" of a step that was not measured."""
     found = ((of["by_horizon"].get(metric, ()), METRICS[metric][1]) for metric in metrics)
     return " / ".join(_number(values, step, digits) for values, digits in found)
+
+
+def _worst(errors: Mapping[str, float]) -> str:
+    return f"{max(errors.values()):.1e}"
 
 
 def _number(values: Sequence[float | None], step: int, digits: str) -> str:

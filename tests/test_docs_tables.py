@@ -100,6 +100,15 @@ def test_splatting_by_hand() -> None:
     assert row == ("1", "547,540", "7.4 ms, 3.5x memcpy time", "14.2 ms, 3.2x memcpy time", "0.34")
 
 
+def test_opacities_by_hand() -> None:
+    """The worst array counts; other families and opacities are left out."""
+    errors = {"outputs": {"image": 2e-7, "coverage": 1e-8}, "gradients": {"radii": 1e-7, "features": 3.04e-7}}
+    row = {"family": "opacity", "knob": 1e-3, "errors": errors, "peers": {"dividing": errors, "clamping": errors}}
+    rows = [row | {"family": "depth"}, row, row | {"knob": 0.5}]
+    _, *found = tables.opacities({"devices": [{"details": {"rows": rows}}]})
+    assert found == [("opacity 0.999", *["2.0e-07 / 3.0e-07"] * 3)]
+
+
 def test_keep_reduces_paths_to_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "DOCS", tmp_path)
     (tmp_path / "results").mkdir()
