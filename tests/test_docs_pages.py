@@ -6,6 +6,8 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
+import conf
+import help_pages
 import pytest
 
 from vestcl.cli import main as cli
@@ -87,20 +89,14 @@ def test_readme_forecasts_from_python(tmp_path: Path, monkeypatch: pytest.Monkey
     assert (tmp_path / "future" / "forecast.json").is_file()
 
 
-def test_the_reference_lists_every_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    import help_pages
-
+def test_the_reference_lists_every_command() -> None:
     assert {"forecast", "devices", "bench"} <= set(help_pages._subcommands(help_pages.help_of(main, [])))
     assert set(help_pages._subcommands(help_pages.help_of(main, ["bench"]))) == set(cli._BENCHES)
     text = help_pages.help_of(main, ["forecast"])
     assert "--compare" in text and "\x1b" not in text and not re.search(r" $", text, re.MULTILINE)
 
 
-def test_links_to_source_files_stay_as_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    import conf
-
+def test_links_to_source_files_stay_as_names() -> None:
     page = ["[`a.py:A`](../vestcl/a.py), [notebook 03](../../notebooks/03_training.ipynb), [memory](../memory.md)"]
     conf.page_text(None, "guides/train", page)
     assert page == ["`a.py:A`, [notebook 03](../notebooks/03_training.ipynb), [memory](../memory.md)"]
@@ -109,10 +105,7 @@ def test_links_to_source_files_stay_as_names(monkeypatch: pytest.MonkeyPatch) ->
     assert "(../paper.md)" in conventions[0] and conventions[0].startswith("# Conventions")
 
 
-def test_formulas_of_docstrings_are_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    import conf
-
+def test_formulas_of_docstrings_are_no_markup() -> None:
     lines = ["Of |x| * y.", "", "    a_i = |p - q|", "", "Args:", "    x_: px."]
     conf.docstring(None, "function", "f", None, None, lines)
     assert lines == ["Of \\|x\\| \\* y.", "", "::", "", "    a_i = |p - q|", "", "Args:", "    x\\_: px."]

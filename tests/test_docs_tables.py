@@ -1,29 +1,16 @@
 """docs/tables.py: the pages' tables are those of the JSON files, and what the script does with other files."""
 
-import importlib.util
 import json
 import re
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
+import rows
+import tables
 
 ROOT = Path(__file__).resolve().parents[1]
 MACHINE = {"vestcl": "0.1.0", "date": "2026-12-01T08:00:00+00:00", "processor": "A CPU", "cores": "2"}
-
-
-def load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("docs_tables", ROOT / "docs" / "tables.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["docs_tables"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-tables = load()
 
 
 def method(*psnr: float, windows: int = 2, **more: list[float | None]) -> dict[str, Any]:
@@ -64,10 +51,10 @@ def test_a_row_by_hand() -> None:
             "geometric": method(31.006, 30, 29.5),
         }
     )
-    heading, *rows = tables.clips("source", ("psnr", "ms_ssim"))(content)
+    heading, *found = rows.clips("source", ("psnr", "ms_ssim"))(content)
     assert heading == ("PSNR / MS-SSIM; windows", "method", "t+1", "t+3", "t+5")
     flow = ("30.00 / 0.900", "28.00 / 0.700", "26.00 / -")
-    assert rows == [
+    assert found == [
         ("/data/highway.mp4 (checked); 2", "constant-velocity flow extrapolation", *flow),
         ("", "geometric", "31.01", "29.50", "-"),
     ]
@@ -83,8 +70,8 @@ def test_presets_by_hand() -> None:
         "points": [point("exact", 211, 25.8), point("blocks 2", 131.4, 25.9)],
         "qualities": {"exact": "exact", "balanced": "blocks 2"},
     }
-    _, *rows = tables.presets({"devices": [{"details": {"front": front}}]})
-    assert rows == [("`exact`", "211", "0", "0.958", ""), ("`balanced`", "131", "+0.10", "0.958", "blocks 2")]
+    _, *found = rows.presets({"devices": [{"details": {"front": front}}]})
+    assert found == [("`exact`", "211", "0", "0.958", ""), ("`balanced`", "131", "+0.10", "0.958", "blocks 2")]
 
 
 def test_splatting_by_hand() -> None:
@@ -96,7 +83,7 @@ def test_splatting_by_hand() -> None:
         "speed": [{"facts": facts, "forward": timed(7.4, 3.5), "both": timed(14.21, 3.2)}],
         "memory": [{"radius": 1.0, "ratio": 0.336}],
     }
-    _, row = tables.splatting({"devices": [{"details": details}]})
+    _, row = rows.splatting({"devices": [{"details": details}]})
     assert row == ("1", "547,540", "7.4 ms, 3.5x memcpy time", "14.2 ms, 3.2x memcpy time", "0.34")
 
 
@@ -104,8 +91,8 @@ def test_opacities_by_hand() -> None:
     """The worst array counts; other families and opacities are left out."""
     errors = {"outputs": {"image": 2e-7, "coverage": 1e-8}, "gradients": {"radii": 1e-7, "features": 3.04e-7}}
     row = {"family": "opacity", "knob": 1e-3, "errors": errors, "peers": {"dividing": errors, "clamping": errors}}
-    rows = [row | {"family": "depth"}, row, row | {"knob": 0.5}]
-    _, *found = tables.opacities({"devices": [{"details": {"rows": rows}}]})
+    three = [row | {"family": "depth"}, row, row | {"knob": 0.5}]
+    _, *found = rows.opacities({"devices": [{"details": {"rows": three}}]})
     assert found == [("opacity 0.999", *["2.0e-07 / 3.0e-07"] * 3)]
 
 
@@ -124,7 +111,7 @@ def test_a_page_keeps_the_rest_of_its_text(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(tables, "ROOT", tmp_path)
     (tmp_path / "a.json").write_text(json.dumps(bench(geometric=method(31.0))))
     source = tables.Source("a.json", "vestcl bench forecast CLIP")
-    monkeypatch.setattr(tables, "TABLES", {"a": tables.Table((source,), tables.clips("source", ("psnr",)))})
+    monkeypatch.setattr(tables, "TABLES", {"a": tables.Table((source,), rows.clips("source", ("psnr",)))})
     text = tables.filled("before\n<!-- table: a -->\nold\n<!-- /table -->\nafter\n")
     assert text.startswith("before\n<!-- table: a -->\n| PSNR; windows | ") and text.endswith(
         "\n<!-- /table -->\nafter\n"
