@@ -13,6 +13,9 @@ DOCS = ["furo>=2024.8", "myst-nb>=1.1", "sphinx>=8"]
 #: Of train/, which is not part of the package.
 TRAIN = ["huggingface_hub>=0.34", "Jinja2>=3.1", "pydantic>=2.7", "PyYAML>=6", "tensorboard>=2.16.2"]
 
+#: Of the page that `vestcl view` shows.
+VIEWER = ["viser>=1.1"]
+
 setup(
     name="vestcl",
     version="0.1.0",
@@ -59,11 +62,13 @@ setup(
     extras_require={
         "dev": [
             *TRAIN,
+            *VIEWER,
             "hypothesis>=6.100",
             "ipykernel>=6.29",
             "mypy>=1.11",
             "nbclient>=0.10",
             "nbformat>=5.10",
+            "playwright>=1.50",
             "pytest>=8",
             "pytest-xdist>=3.6",
             "ruff>=0.8",
@@ -74,6 +79,7 @@ setup(
         "estimators": ["transformers>=4.57.1"],
         "intel": ["intel-cmplr-lib-rt", "intel-opencl-rt"],
         "train": TRAIN,
+        "viewer": VIEWER,
     },
     entry_points={"console_scripts": ["vestcl = vestcl.cli.main:main"]},
 )

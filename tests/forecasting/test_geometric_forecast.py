@@ -11,7 +11,7 @@ from geometric_scenes import HEIGHT, WIDTH, Matrix, decibels, drive, move, point
 
 from vestcl.data import intrinsics
 from vestcl.data.sample import Clip
-from vestcl.forecasting.geometric.forecast import METHOD, _clouds, forecast_clip, forecast_frames, show_frame
+from vestcl.forecasting.geometric.forecast import METHOD, forecast_clip, forecast_frames, frame_clouds, show_frame
 from vestcl.forecasting.geometric.paths import point_paths
 from vestcl.forecasting.geometric.render import holes, show
 from vestcl.forecasting.result import Forecast, View
@@ -120,7 +120,8 @@ def test_what_the_frame_before_showed_is_at_its_place() -> None:
     """Its cloud alone, two frame intervals on: 4 dB and more better than itself again, where it shows
     anything and in the oncoming car."""
     clip, cameras = perception(*PASSING).clip, true_cameras(perception(*PASSING).clip)
-    before = _clouds(seen := perception(*PASSING), NOW, point_paths(seen, NOW))[1](1, [np.eye(4), *cameras])
+    seen = perception(*PASSING)
+    before = frame_clouds(seen, NOW, point_paths(seen, NOW))[1](1, lambda step: [np.eye(4), *cameras][int(step)])
     shown = show([before], clip[NOW].K, np.eye(4), HEIGHT, WIDTH)
     seen, wanted = ~holes(shown)[0], clip[NOW + 1].read_image()
     assert seen.mean() > 0.5
@@ -149,7 +150,7 @@ def test_what_the_frame_before_showed_is_as_bright_as_the_current_one(gain: floa
     clip = perception(*PASSING).clip
     earlier = [replace(sample, image=Exposed(sample.image, gain)) for sample in clip.samples[:NOW]]
     jump = replace(clip, samples=(*earlier, *clip.samples[NOW:]))
-    before = _clouds(seen := Perception(jump), NOW, point_paths(seen, NOW))[1](1, [np.eye(4)] * 2).image
+    before = frame_clouds(seen := Perception(jump), NOW, point_paths(seen, NOW))[1](1, lambda step: np.eye(4)).image
     wanted = clip[NOW - 1].read_image()
     unclipped = gain * wanted < 0.95
     assert np.abs(before - wanted)[unclipped].mean() < 0.01

@@ -17,7 +17,7 @@ def lowest_versions() -> list[str]:
         runpy.run_path(str(SETUP))
     arguments = setup.call_args.kwargs
     extras = arguments["extras_require"]
-    used = [*arguments["install_requires"], *extras["train"], *extras["estimators"]]
+    used = [*arguments["install_requires"], *extras["train"], *extras["estimators"], *extras["viewer"]]
     pinned = [requirement.replace(">=", "==") for requirement in used if not requirement.startswith("torch>=")]
     return pinned + [tool for tool in extras["dev"] if tool not in used]
 

@@ -149,6 +149,33 @@ class Forecast(ClipOptions):
 
 
 @dataclass(frozen=True)
+class View(ClipOptions):
+    """Show a clip and its future in a browser: a free camera, and sliders of the frame and of the time ahead.
+
+    Needs viser: pip install 'vestcl[viewer]'. Ctrl-C closes it.
+    """
+
+    input: tyro.conf.Positional[str]
+    """A clip, as `vestcl forecast` opens it, or street:SEED for a procedural street, which needs no file."""
+    model: str | None = None
+    """Show the forecast of this network, too: vest-s, a .safetensors file, a training checkpoint's folder."""
+    quality: Literal["exact", "balanced", "fast"] | None = None
+    """With --model: the inference preset to begin with. Without it: balanced."""
+    frame: int | None = None
+    """The frame t to begin with, counted from 0. Without it: 3, or the last of a shorter clip."""
+    frames: int = 30
+    """Frames of a street."""
+    port: int = 8080
+    """Of 127.0.0.1; where it is taken, the next one that is free."""
+    height: int | None = None
+    """Pixels; without it as the clip is, or in proportion to --width."""
+    width: int | None = None
+    """Pixels; without it as the clip is, or in proportion to --height."""
+    device: str | None = None
+    """OpenCL device: an index of `vestcl devices` or a part of its name."""
+
+
+@dataclass(frozen=True)
 class Prepare(ClipOptions):
     """Compute depth, masks, inpainting and motion of clips' frames once, for training, evaluation and forecasts.
 

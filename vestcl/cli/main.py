@@ -1,4 +1,4 @@
-"""The command line: `vestcl forecast`, `prepare`, `devices`, `doctor`, `demo`, `bench`.
+"""The command line: `vestcl forecast`, `view`, `prepare`, `devices`, `doctor`, `demo`, `bench`.
 
 Importing this module takes no time: whatever does is imported by `main`, which Ctrl-C ends by one line at any moment.
 """
@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Final
 from vestcl import interrupt
 
 if TYPE_CHECKING:
-    from vestcl.cli.commands import Bench, Demo, Devices, Doctor, Forecast, Prepare
+    from vestcl.cli.commands import Bench, Demo, Devices, Doctor, Forecast, Prepare, View
 
-__all__ = ["Bench", "Demo", "Devices", "Doctor", "Forecast", "Prepare", "main"]
+__all__ = ["Bench", "Demo", "Devices", "Doctor", "Forecast", "Prepare", "View", "main"]
 
 #: Modules in vestcl.bench: the ``main`` of `vestcl bench train-step`'s takes a TrainStepBench, may return an exit code.
 _BENCHES: Final = {
@@ -38,6 +38,7 @@ _BENCHES: Final = {
 _COMMANDS: Final = {
     "Forecast": ("vestcl.cli.forecast", "run"),
     "Prepare": ("vestcl.cli.prepare", "run"),
+    "View": ("vestcl.cli.view", "run"),
     "Devices": ("vestcl.cli.devices", "run"),
     "Doctor": ("vestcl.cli.devices", "run_doctor"),
 }
@@ -77,6 +78,7 @@ def _parsed_command(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
 
     kinds: dict[str, Callable[..., Any]] = {
         "forecast": commands.Forecast,
+        "view": commands.View,
         "prepare": commands.Prepare,
         "devices": commands.Devices,
         "doctor": commands.Doctor,

@@ -52,6 +52,7 @@ RANGES: Final[Mapping[str, Range]] = {
     "height": _SIDE,
     "horizons": Range(1, 1000),
     "last": Range(0),
+    "port": Range(1, 65535),
     "radii": Range(0, 1e6, between=True),
     "radius": Range(0, 1e6, between=True),
     "runs": Range(1, 100000),

@@ -172,12 +172,7 @@ class Future(Mapping[str, FutureView]):
             OSError: the file can't be written.
         """
         frame = self[self._view(view).name][step]
-        _, height, width = frame.depth.shape
-        v, u = np.mgrid[:height, :width] + 0.5
-        rays = np.linalg.inv(frame.K) @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
-        known = frame.depth.ravel() > 0
-        points = (rays * frame.depth.reshape(1, -1))[:, known].T
-        write_ply(path, points.astype(np.float32), frame.image.reshape(3, -1)[:, known].T)
+        write_ply(path, *visible_points(frame.image, frame.depth, frame.K))
         return Path(path)
 
     def _view(self, name: str | None) -> View:
@@ -190,3 +185,24 @@ class Future(Mapping[str, FutureView]):
 
     def _of(self, name: str) -> list[Rendered]:
         return [frame[name] for frame in self.forecast.frames]
+
+
+def visible_points(
+    image: NDArray[np.float32], depth: NDArray[np.float32], K: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The points that an image shows: p = z K^-1 (u, v, 1) for each pixel of known depth z.
+
+    Args:
+        image: [3, H, W].
+        depth: [1, H, W] m; 0 where unknown.
+        K: [3, 3] px.
+
+    Returns:
+        Points [N, 3] m in the camera's axes, and their colours [N, 3].
+    """
+    _, height, width = depth.shape
+    v, u = np.mgrid[:height, :width] + 0.5
+    rays = np.linalg.inv(K) @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
+    known = depth.ravel() > 0
+    points = (rays * depth.reshape(1, -1))[:, known].T
+    return points.astype(np.float32), image.reshape(3, -1)[:, known].T

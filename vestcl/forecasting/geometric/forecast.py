@@ -109,14 +109,14 @@ def forecast_frames(
     cameras = forecast_cameras(perception, index, ahead) if future_from_cur is None else list(future_from_cur)
     if len(cameras) < steps:
         raise ValueError(f"`future_from_cur` must be of {steps} steps or more, got {len(cameras)}")
-    clouds = _clouds(perception, index, paths or point_paths(perception, index), remembered)
-    start, frames = time.perf_counter(), list[dict[str, Rendered]]()
+    clouds = frame_clouds(perception, index, paths or point_paths(perception, index), remembered)
+    start, frames, size = time.perf_counter(), list[dict[str, Rendered]](), (clip[0].height, clip[0].width)
     for step in ahead:
-        moved = [cloud(step, [np.eye(4), *cameras]) for cloud in clouds]
+        moved = [cloud(step, _by_step(cameras)) for cloud in clouds]
         frames.append({})
         for view in views:
             tell("render")
-            frames[-1][view.name] = _render(moved, clip[index].K if view.K is None else view.K, view, clip)
+            frames[-1][view.name] = render_clouds(moved, clip[index].K if view.K is None else view.K, view, *size)
     seconds = perception.seconds | {"render": time.perf_counter() - start}
     return Forecast(METHOD, cameras[:steps], frames, seconds, notes=input_notes(perception, index))
 
@@ -159,16 +159,38 @@ def show_frame(
     """
     clip = perception.clip
     remembered, paths = remember(perception, index, memory), Paths(perception.frame(index))
-    clouds = [cloud(0, [np.eye(4)]) for cloud in _clouds(perception, index, paths, remembered)]
-    return {view.name: _render(clouds, clip[index].K if view.K is None else view.K, view, clip) for view in views}
+    clouds = [cloud(0, lambda step: np.eye(4)) for cloud in frame_clouds(perception, index, paths, remembered)]
+    K, size = clip[index].K, (clip[0].height, clip[0].width)
+    return {view.name: render_clouds(clouds, K if view.K is None else view.K, view, *size) for view in views}
 
 
-MovingCloud = Callable[[int, list[NDArray[np.float64]]], FrameCloud]
-"""A cloud at a step, given ``future_from_cur`` of all steps from 0."""
+Cameras = Callable[[float], NDArray[np.float64]]
+"""``future_from_cur`` [4, 4] m after so many intervals."""
 
 
-def _clouds(perception: Perception, index: int, paths: Paths, memory: SceneMemory | None = None) -> list[MovingCloud]:
-    """What the current frame shows; what the one before did; what is remembered; what is behind the foreground."""
+def _by_step(cameras: Sequence[NDArray[np.float64]]) -> Cameras:
+    """Of whole steps: ``cameras`` from step 1 on."""
+    return lambda step: np.eye(4) if step == 0 else cameras[round(step) - 1]
+
+
+MovingCloud = Callable[[float, Cameras], FrameCloud]
+"""A cloud after so many intervals, given the camera's motion; it is asked for that time and one interval before."""
+
+
+def frame_clouds(
+    perception: Perception, index: int, paths: Paths, memory: SceneMemory | None = None
+) -> list[MovingCloud]:
+    """What the current frame shows; what the one before did; what is remembered; what is behind the foreground.
+
+    Args:
+        perception: of the clip; the clouds don't need it once they are made.
+        index: the frame t, 1 or more.
+        paths: of the points of frame t.
+        memory: see `remember`.
+
+    Returns:
+        Three or four clouds, as `render_clouds` takes them.
+    """
     K = perception.clip[index].K
     cur, prev = perception.seen(index), perception.surface(index - 1)
     cur_from_prev = np.asarray(np.linalg.inv(perception.prev_from_cur(index)), np.float64)
@@ -189,7 +211,7 @@ def _shown(paths: Paths, own: NDArray[np.bool_]) -> MovingCloud:
     z_src = frame.depth.reshape(-1).astype(np.float32)
     now = paths.at(0, np.eye(4))
 
-    def moved(step: int, future_from_cur: NDArray[np.float64]) -> NDArray[np.float32]:
+    def moved(step: float, future_from_cur: NDArray[np.float64]) -> NDArray[np.float32]:
         points = np.where(own, now, paths.at(step, future_from_cur))
         return np.asarray(cv2.transpose(points.astype(np.float32).reshape(3, -1)))
 
@@ -227,24 +249,24 @@ def _static(memory: SceneMemory) -> MovingCloud:
 
 
 def _moving(
-    moved: Callable[[int, NDArray[np.float64]], NDArray[np.floating]],
+    moved: Callable[[float, NDArray[np.float64]], NDArray[np.floating]],
     z_src: NDArray[np.float32],
     image: NDArray[np.float32],
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],
 ) -> MovingCloud:
     """A cloud whose points [N, 3] are ``moved(step, future_from_cur)``: a step's are the next one's points before."""
-    kept: dict[int, NDArray[np.floating]] = {}
+    kept: dict[float, NDArray[np.floating]] = {}
 
-    def points_at(step: int, future_from_cur: NDArray[np.float64]) -> NDArray[np.floating]:
+    def points_at(step: float, future_from_cur: NDArray[np.float64]) -> NDArray[np.floating]:
         if step not in kept:
-            for earlier in [k for k in kept if k < step - 1]:
-                del kept[earlier]
+            for other in [k for k in kept if not step - 1 <= k <= step + 1]:
+                del kept[other]
             kept[step] = moved(step, future_from_cur)
         return kept[step]
 
-    def at(step: int, future_from_cur: list[NDArray[np.float64]]) -> FrameCloud:
-        there, before = (points_at(k, future_from_cur[k]) for k in (step, step - 1))
+    def at(step: float, camera: Cameras) -> FrameCloud:
+        there, before = (points_at(k, camera(k)) for k in (step, step - 1))
         return FrameCloud(there.astype(np.float32), z_src, image, (there - before).astype(np.float32), rows, columns)
 
     return at
@@ -257,21 +279,30 @@ def _transform(dst_from_src: NDArray[np.float64], points: NDArray[np.float64]) -
     return np.asarray(cv2.transform(points[:, None], dst_from_src[:3]), np.float64)[:, 0]
 
 
-def _render(clouds: list[FrameCloud], K: NDArray[np.float64], view: View, clip: Clip) -> Rendered:
+def render_clouds(
+    clouds: Sequence[FrameCloud], K: NDArray[np.float64], view: View, height: int, width: int
+) -> Rendered:
     """What was seen, in its holes what is remembered, then what is behind the foreground, then what surrounds them.
+
+    Args:
+        clouds: of the current frame, of the one before, remembered ones (may be left out), and the background.
+        K: [3, 3] px, of the view.
+        view: where it is; its own ``K`` is not looked at.
+        height: px.
+        width: px.
 
     The inpainted background is a guess, and only wanted where the foreground has moved away: cracks, and what enters
     the picture from outside, are better guessed from beside. On kitti_clip's traffic that is worth 3 dB.
     """
-    seen_from = K, view.tgt_from_next, clip[0].height, clip[0].width
-    shown = show(clouds[:2], *seen_from)
+    seen_from = K, view.tgt_from_next, height, width
+    shown = show(list(clouds[:2]), *seen_from)
     hole = holes(shown)
     if len(clouds) > 3 and hole.any():
-        shown = _filled(shown, show(clouds[2:3], *seen_from, where=hole), hole)
+        shown = _filled(shown, show(list(clouds[2:3]), *seen_from, where=hole), hole)
         hole = holes(shown)
     coverage, deep = shown.coverage, deep_holes(hole)
     if deep.any():
-        behind = show(clouds[-1:], *seen_from, where=deep)
+        behind = show(list(clouds[-1:]), *seen_from, where=deep)
         deep &= ~holes(behind)
         shown, hole = Shown(_filled(shown, behind, deep).planes, coverage), hole & ~deep
     ahead = K @ view.tgt_from_next[:3, 2]

@@ -134,16 +134,21 @@ def refined(
     motion: Corrections,
     views: Sequence[View],
     frames: Sequence[Mapping[str, Rendered]],
+    steps: Sequence[int] | None = None,
 ) -> list[dict[str, Rendered]]:
-    """``frames`` of the geometric forecast, under ``motion``, with what refinement adds to their images."""
+    """``frames`` of the geometric forecast, under ``motion``, with what refinement adds to their images.
+
+    They are of ``steps``, rising; None is 1, 2, ...
+    """
+    shown = range(1, len(frames) + 1) if steps is None else steps
     if model.refine.of_forecast:
         return [
             {name: retouched(model, rendered, ahead, perception.clip.interval) for name, rendered in frame.items()}
-            for ahead, frame in enumerate(frames, 1)
+            for ahead, frame in zip(shown, frames, strict=True)
         ]
     path = forecast_path(perception, index, 1)._replace(future_from_cur=motion.cameras)
     given = given_motion(perception, index, path)
-    added = added_by_refinement(model, given, motion, views, range(1, len(frames) + 1))
+    added = added_by_refinement(model, given, motion, views, shown)
     done = []
     for frame, by_view in zip(frames, added, strict=True):
         images = {name: change + (frame[name].image if adds else 0) for name, (change, adds) in by_view.items()}
