@@ -1,6 +1,7 @@
 """The scenes of a clip: prepared in a thread of their own, nearest first, and kept."""
 
 import collections
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -30,6 +31,8 @@ _AHEAD_OF_NEED: Final = (1, -1, 2, 3)
 #: Seconds without input before frames are prepared ahead of need.
 _IDLE: Final = 1.0
 
+_LOG: Final = logging.getLogger(__name__)
+
 
 class Wanted(NamedTuple):
     """What a scene is of."""
@@ -51,7 +54,7 @@ class Engine:
             geometric forecast only.
         preset: of the network, to begin with.
         inpaint: see `Perception`.
-        when_ready: called after a scene was prepared, and after one failed, in the preparing thread.
+        when_ready: called with a scene that was prepared, or failed, or with the number of a true frame that was read.
 
     Raises:
         ValueError: a clip of one frame, no such network, or one that forecasts by itself.
@@ -64,12 +67,11 @@ class Engine:
         preset: "Quality" = "balanced",
         *,
         inpaint: Inpainter | None = None,
-        when_ready: Callable[[], None] = lambda: None,
+        when_ready: Callable[[Wanted | int], None] = lambda ready: None,
     ) -> None:
         if len(clip) < 2:
             raise ValueError(f"{clip.name}: must have 2 frames or more, got {len(clip)}")
         self.clip, self.when_ready = clip, when_ready
-        self.failure = ""
         self._model = model
         self._models: dict[str, Forecaster] = {}
         self.methods: tuple[str, ...] = (METHOD,)
@@ -80,6 +82,7 @@ class Engine:
         self._truths: collections.OrderedDict[int, NDArray[np.float32]] = collections.OrderedDict()
         self._failed: dict[Wanted, str] = {}
         self._wanted: Wanted | None = None
+        self._unread: int | None = None
         self._active, self._closed = 0.0, False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._prepare_all, name="vestcl view: prepare", daemon=True)
@@ -105,22 +108,25 @@ class Engine:
         self._active = time.monotonic()
 
     def truth(self, index: int, ahead: float) -> NDArray[np.float32] | None:
-        """The true image [3, H, W] of frame ``index`` + ``ahead``; None where there is none."""
+        """The true image [3, H, W] of frame ``index`` + ``ahead``; None where there is none, or where it is still to be
+        read: that is done next."""
+        frame = self._true_frame(index, ahead)
+        if frame is None:
+            return None
+        with self._changed:
+            if frame not in self._truths:
+                self._unread = frame
+                self._changed.notify_all()
+            return self._truths.get(frame)
+
+    def _true_frame(self, index: int, ahead: float) -> int | None:
         steps = round(ahead)
         if steps != ahead:
             return None
-        if steps > 0:
-            after = self.clip.after(index, steps)
-            frame = after[steps - 1] if len(after) == steps else -1
-        else:
-            frame = index + steps
-        if frame < 0:
-            return None
-        if frame not in self._truths:
-            self._truths[frame] = self.clip[frame].read_image().copy()
-            while len(self._truths) > _KEPT:
-                self._truths.popitem(last=False)
-        return self._truths[frame]
+        if steps <= 0:
+            return index + steps
+        after = self.clip.after(index, steps)
+        return after[steps - 1] if len(after) == steps else None
 
     def close(self) -> None:
         """End the thread, after the scene that it prepares."""
@@ -148,19 +154,35 @@ class Engine:
                     wanted = self._next()
                 if self._closed or wanted is None:
                     return
-            self._prepare(wanted)
-            self.when_ready()
+            if isinstance(wanted, int):
+                self._read_truth(wanted)
+            else:
+                self._prepare(wanted)
+            self.when_ready(wanted)
 
-    def _next(self) -> Wanted | None:
-        """The wanted scene, or where it is there one next to it."""
+    def _next(self) -> Wanted | int | None:
+        """The wanted scene, or where it is there a true frame, or a scene next to it."""
         if self._wanted is None:
             return None
+        if self._unread is not None and (self._wanted in self._scenes or self._wanted in self._failed):
+            return self._unread
         idle = time.monotonic() - self._active > _IDLE
         for step in (0, *(_AHEAD_OF_NEED if idle else ())):
             each = self._wanted._replace(frame=self._wanted.frame + step)
             if 1 <= each.frame < len(self.clip) and each not in self._scenes and each not in self._failed:
                 return each
         return None
+
+    def _read_truth(self, frame: int) -> None:
+        try:
+            image = self.clip[frame].read_image().copy()
+        except (OSError, ValueError) as error:
+            _LOG.warning("frame %d has no true image: %s", frame, error)
+            image = np.zeros((3, self.clip[0].height, self.clip[0].width), np.float32)
+        with self._changed:
+            self._truths[frame], self._unread = image, None
+            while len(self._truths) > _KEPT:
+                self._truths.popitem(last=False)
 
     def _prepare(self, wanted: Wanted) -> None:
         try:

@@ -60,9 +60,8 @@ def geometric_motion(perception: Perception, index: int) -> Motion:
         perception: of the clip.
         index: the frame t, 1 or more.
     """
-    ticks = range(1, MOST_AHEAD * TICKS + 1)
-    future = forecast_cameras(perception, index, [tick / TICKS for tick in ticks])
-    cameras = _seen(perception, index) | dict(zip(ticks, future, strict=True))
+    future = forecast_cameras(perception, index, range(1, MOST_AHEAD + 1))
+    cameras = _seen(perception, index) | _between([np.eye(4), *future])
     return Motion(METHOD, point_paths(perception, index), cameras)
 
 

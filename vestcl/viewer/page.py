@@ -20,7 +20,7 @@ _PAST, _FORECAST, _TRUE = (130, 130, 130), (255, 140, 0), (0, 170, 80)
 _KEYFRAME, _VELOCITY = (60, 120, 255), (230, 30, 60)
 
 #: Metres: the depth of a frustum that is drawn.
-_FRUSTUM: Final = 0.35
+_FRUSTUM: Final = 0.15
 
 _PANELS: Final = ("truth", "error", "depth", "coverage")
 
@@ -39,7 +39,8 @@ class Page:
         self._server, self._engine = server, engine
         self.keyframes: list[camera.Keyframe] = []
         theme = {"show_share_button": False, "show_logo": False, "dark_mode": True}  # shared pages leave this machine
-        server.gui.configure_theme(control_layout="collapsible", **theme)
+        server.gui.configure_theme(**theme)
+        server.gui.main_panel.dock_right()
         server.scene.set_up_direction("-y")
         self._add_camera(engine)
         self._status = server.gui.add_markdown("")

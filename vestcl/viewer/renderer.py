@@ -15,7 +15,10 @@ from vestcl.viewer.engine import Engine, Wanted
 from vestcl.viewer.scene import Scene
 
 #: Seconds without a movement from which on a camera is still.
-STILL: Final = 0.25
+STILL: Final = 0.4
+
+#: Seconds without a movement before the panels are rendered.
+_PANELS_STILL: Final = 1.0
 
 #: Coarse pictures have each so-manieth row and column: the finest, and the coarsest.
 _STRIDES: Final = (2, 4)
@@ -127,8 +130,16 @@ class Renderer:
                 visitor.moved_at, visitor.coarse_due, visitor.full_due = time.monotonic(), True, True
             self._changed.notify_all()
 
+    def ready(self, what: Wanted | int) -> None:
+        """A scene is prepared, or a true frame (its number) read."""
+        if isinstance(what, int):
+            with self._changed:
+                self._panels_due = True
+        elif what == self.screen.look().wanted:
+            self.look_changed()
+
     def look_changed(self) -> None:
-        """The controls say something else, or a scene is ready."""
+        """The controls say something else."""
         with self._changed:
             for visitor in self.visitors.values():
                 visitor.moved_at, visitor.coarse_due, visitor.full_due = time.monotonic(), True, True
@@ -158,7 +169,7 @@ class Renderer:
             if not done:
                 with self._changed:
                     if not self._closed:
-                        self._changed.wait(STILL / 2)
+                        self._changed.wait(STILL / 4)
 
     def _step(self) -> bool:
         """The most urgent piece of work; False where there is none."""
@@ -183,7 +194,7 @@ class Renderer:
         if self._jobs:
             self._do_job()
             return True
-        if self._panels_due and visitors and all(now - visitor.moved_at >= STILL for visitor in visitors):
+        if self._panels_due and visitors and all(now - visitor.moved_at >= _PANELS_STILL for visitor in visitors):
             self._panels_due = False
             self.screen.show_panels(self._panels(scene, look))
             return True

@@ -1,5 +1,7 @@
 """The viewer's server: on the loopback address, and closed with the command that opened it."""
 
+import contextlib
+import io
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -70,10 +72,15 @@ class Viewer:
             raise ValueError(f"`frame` must be 1 ... {len(clip) - 1}, to have a frame before it, got {first}")
         self.engine = Engine(clip, model, preset, inpaint=inpaint)
         self._ended = threading.Event()
-        self.server = viser.ViserServer(host=HOST, port=port, label=f"vestcl: {clip.name}", verbose=False)
-        self.page = Page(self.server, self.engine, first, preset)
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):  # viser's own table of addresses
+                self.server = viser.ViserServer(host=HOST, port=port, label=f"vestcl: {clip.name}", verbose=False)
+            self.page = Page(self.server, self.engine, first, preset)
+        except BaseException:
+            self.engine.close()
+            raise
         self.renderer = Renderer(self.engine, self.page)
-        self.engine.when_ready = self.renderer.look_changed
+        self.engine.when_ready = self.renderer.ready
         self._connect()
         self.renderer.start()
 
@@ -92,7 +99,8 @@ class Viewer:
         self._ended.set()
         self.renderer.close()
         self.engine.close()
-        self.server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
 
     def __enter__(self) -> "Viewer":
         return self
