@@ -68,7 +68,7 @@ class Tab:
         size: (width, height) px of the window.
     """
 
-    def __init__(self, opened: Any, url: str, size: tuple[int, int] = (800, 300)) -> None:
+    def __init__(self, opened: Any, url: str, size: tuple[int, int] = (640, 260)) -> None:
         self.context = opened.new_context(viewport={"width": size[0], "height": size[1]}, accept_downloads=True)
         self.page = self.context.new_page()
         self.outside: list[str] = []

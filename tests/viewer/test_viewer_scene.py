@@ -8,8 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 import vestcl
+from vestcl import opencl
 from vestcl.forecasting.result import View
 from vestcl.forecasting.views import parse_view
+from vestcl.opencl import selection
 from vestcl.viewer.engine import Engine, Wanted
 from vestcl.viewer.motion import MOST_AHEAD
 from vestcl.viewer.scene import Scene
@@ -123,6 +125,17 @@ def test_true_frames_are_read_when_they_are_asked_for(clip: vestcl.Clip, engine:
         time.sleep(0.02)
     assert truth is not None
     np.testing.assert_array_equal(truth, clip[NOW + 2].read_image())
+
+
+def test_threads_use_the_device_that_was_chosen(clip: vestcl.Clip) -> None:
+    seen = []
+    with opencl.use(mapping="pixel") as chosen:
+        engine = Engine(clip, when_ready=lambda ready: seen.append(selection.current()))
+        try:
+            scene_of(engine, "geometric")
+        finally:
+            engine.close()
+    assert seen and all(session is chosen for session in seen)
 
 
 def test_refusals(clip: vestcl.Clip) -> None:

@@ -1,6 +1,7 @@
 """What `vestcl view` does: open a clip, serve the viewer's page, and end with Ctrl-C or the page's button."""
 
 import sys
+import warnings
 
 from vestcl import interrupt, opencl
 from vestcl.cli import checks, commands
@@ -25,10 +26,12 @@ def run(options: commands.View) -> None:
     inpaint = None if options.inpaint is None else inpainter(options.inpaint, "inpaint")
     preset, index, port = options.quality or "balanced", options.frame, options.port
     with (
+        warnings.catch_warnings(),
         opencl.use(options.device),
         interrupt.summary(lambda: "the viewer is closed"),
         Viewer(clip, options.model, preset, index=index, port=port, inpaint=inpaint) as viewer,
     ):
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # of a page that was closed
         print(f"{viewer.url} shows {clip.name}; Ctrl-C closes it")
         sys.stdout.flush()
         viewer.wait()

@@ -1,6 +1,7 @@
 """The scenes of a clip: prepared in a thread of their own, nearest first, and kept."""
 
 import collections
+import contextvars
 import logging
 import threading
 import time
@@ -85,7 +86,10 @@ class Engine:
         self._unread: int | None = None
         self._active, self._closed = 0.0, False
         self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._prepare_all, name="vestcl view: prepare", daemon=True)
+        here = contextvars.copy_context()  # which has the OpenCL device that was chosen
+        self._thread = threading.Thread(
+            target=here.run, args=(self._prepare_all,), name="vestcl view: prepare", daemon=True
+        )
         self._thread.start()
 
     def scene(self, wanted: Wanted) -> Scene | None:

@@ -1,6 +1,7 @@
 """The thread that renders: coarse pictures while a camera moves, a full one when it is still, then panels and files."""
 
 import collections
+import contextvars
 import logging
 import threading
 import time
@@ -96,7 +97,8 @@ class Renderer:
         self._stride = _STRIDES[0]
         self._changed = threading.Condition()
         self._closed = False
-        self._thread = threading.Thread(target=self._run, name="vestcl view: render", daemon=True)
+        here = contextvars.copy_context()  # which has the OpenCL device that was chosen
+        self._thread = threading.Thread(target=here.run, args=(self._run,), name="vestcl view: render", daemon=True)
 
     def start(self) -> None:
         """Begin to render."""
@@ -236,6 +238,9 @@ class Renderer:
         self._send(visitor, scene, pictures.picture_of(rendered, look.colour), pose, "png")
 
     def _send(self, visitor: Visitor, scene: Scene, picture: NDArray[np.uint8], pose: camera.Pose, kind: str) -> None:
+        with self._changed:
+            if visitor not in self.visitors.values():  # closed meanwhile
+                return
         shape = float(scene.K[1, 1] / scene.K[0, 0])
         visitor.client.scene.set_background_image(camera.on_canvas(picture, pose.aspect, shape), format=kind)
         visitor.client.flush()
