@@ -9,7 +9,10 @@ from numpy.typing import NDArray
 
 import vestcl
 from vestcl import opencl
-from vestcl.forecasting.result import View
+from vestcl.forecasting.network import backtest
+from vestcl.forecasting.network import forecast as network
+from vestcl.forecasting.network.learned import PARTS
+from vestcl.forecasting.result import LearnedPart, View
 from vestcl.forecasting.views import parse_view
 from vestcl.opencl import selection
 from vestcl.viewer.engine import Engine, Wanted
@@ -66,6 +69,22 @@ def test_a_still_image_is_the_forecast(clip: vestcl.Clip, engine: Engine, aside:
             assert np.abs(rendered.image - wanted.image).max() <= 1 / 255
             np.testing.assert_allclose(rendered.depth, wanted.depth, rtol=1e-3, atol=1e-3)
             np.testing.assert_allclose(rendered.coverage, wanted.coverage, atol=1e-3)
+
+
+def test_a_still_image_with_all_learned_parts(clip: vestcl.Clip, aside: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if each part had passed its test; here none may."""
+    chosen = {part: LearnedPart(True, "the test has it") for part in PARTS}
+    for module in (backtest, network):
+        monkeypatch.setattr(module, "choose_parts", lambda *given: chosen)
+    wanted = vestcl.forecast(clip, NOW, steps=2, views=[aside], model="vest-s")["aside"][2]
+    engine = Engine(clip, "vest-s")
+    try:
+        scene, geometric = (scene_of(engine, method) for method in ("vest-s", "geometric"))
+        image = scene.render(2.0, aside).image
+        assert np.abs(image - wanted.image).max() <= 1 / 255
+        assert np.abs(image - geometric.render(2.0, aside).image).max() > 2 / 255
+    finally:
+        engine.close()
 
 
 def test_now_and_before(clip: vestcl.Clip, scene: Scene) -> None:

@@ -99,6 +99,8 @@ def _run(command: Any) -> int:
     threads.apply(getattr(command, "threads", None))
     start, busy = time.perf_counter(), time.process_time()
     status = _run_here(command)
+    if type(command).__name__ == "View":  # which waits for its visitors
+        return status
     if line := threads.slow_line(time.perf_counter() - start, time.process_time() - busy):
         print(line, file=sys.stderr)
     return status

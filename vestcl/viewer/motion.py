@@ -78,12 +78,11 @@ def network_motion(perception: Perception, index: int, model: "Forecaster") -> M
     from vestcl.forecasting.network import learned
     from vestcl.forecasting.network.backtest import choose_parts
     from vestcl.forecasting.network.forecast import interval_note
-    from vestcl.prepare.frame import prepare_frame
 
     clip, paths = perception.clip, point_paths(perception, index)
     note = interval_note(clip, index, model.config)
     known = note is None and interval_note(clip, max(index - 1, 1), model.config) is None
-    prepare_frame(perception, index - 1)
+    perception.seen(index - 1)
     with torch.inference_mode():
         parts = choose_parts(perception, model, index, known)
         motion = learned.chosen_motion(perception, model, index, MOST_AHEAD, parts)

@@ -13,8 +13,8 @@ from vestcl.constants import SKY_DEPTH
 from vestcl.data import calibration
 from vestcl.data.sample import Clip
 from vestcl.forecasting.geometric.forecast import frame_clouds, render_clouds
+from vestcl.forecasting.geometric.frame_cloud import FrameCloud
 from vestcl.forecasting.geometric.memory import MEMORY, remember
-from vestcl.forecasting.geometric.render import FrameCloud
 from vestcl.forecasting.result import Rendered, View
 from vestcl.scene.perception import Perception
 from vestcl.viewer.motion import MOST_AHEAD, Matrix, Motion, on_tick
