@@ -91,8 +91,8 @@ class Tab:
 
     def pixels(self) -> NDArray[np.uint8]:
         """[H, W, 3] of the picture that was shown last."""
-        _, width, height = self.page.evaluate("window.shown[window.shown.length - 1]")
-        flat = np.array(self.page.evaluate("window.pixels"), np.uint8)
+        (_, width, height), values = self.page.evaluate("[window.shown[window.shown.length - 1], window.pixels]")
+        flat = np.array(values, np.uint8)
         return flat.reshape(int(height), int(width), 4)[..., :3]
 
     def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 10) -> None:
@@ -100,7 +100,9 @@ class Tab:
         mouse = self.page.mouse
         mouse.move(*start)
         mouse.down()
-        mouse.move(*end, steps=steps)
+        for step in range(1, steps + 1):
+            mouse.move(*(first + (last - first) * step / steps for first, last in zip(start, end, strict=True)))
+            self.page.wait_for_timeout(15)
         mouse.up()
 
     def close(self) -> None:

@@ -25,6 +25,9 @@ from vestcl.viewer.server import Viewer
 HEIGHT, WIDTH = 48, 160
 NOW = 3
 
+#: Where the mouse drags, px: between the page's notes and its controls.
+DRAG = (290, 60), (310, 120)
+
 
 @pytest.fixture(scope="module")
 def clip() -> vestcl.Clip:
@@ -90,20 +93,15 @@ def test_it_asks_for_nothing_outside(tab: Tab) -> None:
 
 
 def test_a_drag_changes_the_picture(viewer: Viewer, clip: vestcl.Clip, tab: Tab) -> None:
-    before, shown, pose = tab.pixels(), len(tab.times()), shown_view(viewer, clip).tgt_from_next
+    before, shown, pose = middle(tab.pixels()), len(tab.times()), shown_view(viewer, clip).tgt_from_next
     np.testing.assert_allclose(pose, np.eye(4), atol=1e-6)
-    tab.page.mouse.move(200, 150)
-    tab.page.mouse.down()
-    for step in range(30):
-        tab.page.mouse.move(200 + 2 * step, 150 + step // 2)
-        tab.page.wait_for_timeout(20)
-    sizes = tab.page.evaluate(f"window.shown.slice({shown}).map((each) => each[1])")
-    tab.page.mouse.up()
-    assert sizes and max(sizes) <= WIDTH // 2, "coarse pictures while it moves"
-    tab.wait_for(WIDTH, more_than=shown)
+    tab.drag(*DRAG, steps=30)
+    tab.wait_for(WIDTH, more_than=shown + 1)
+    widths = tab.page.evaluate(f"window.shown.slice({shown}).map((each) => each[1])")
+    assert min(widths) <= WIDTH // 2, "coarse images while it moves"
     moved = shown_view(viewer, clip).tgt_from_next
     assert np.abs(moved - pose).max() > 0.05
-    assert np.abs(tab.pixels().astype(int) - before).mean() > 2
+    assert np.abs(middle(tab.pixels()).astype(int) - before).mean() > 2
 
 
 @pytest.mark.parametrize("step", [1, 3])
@@ -187,7 +185,7 @@ def test_a_camera_path(viewer: Viewer, tab: Tab, tmp_path: Path) -> None:
     press(tab, "save video")
     tab.page.get_by_text("a camera path needs 2 keyframes").wait_for(timeout=20_000)
     shown = len(tab.times())
-    tab.drag((200, 150), (260, 170))
+    tab.drag(*DRAG)
     tab.wait_for(WIDTH, more_than=shown)
     press(tab, "add keyframe")
     until(lambda: len(viewer.page.keyframes) == 2)
@@ -210,7 +208,7 @@ def test_second_visitors_and_reloads_do_no_harm(viewer: Viewer, opened: Any, tab
     other.wait_for(WIDTH)
     until(lambda: len(viewer.renderer.visitors) == 2)
     before = len(tab.times())
-    other.drag((200, 150), (240, 150))
+    other.drag(*DRAG)
     other.wait_for(WIDTH, more_than=2)
     assert len(tab.times()) == before, "each visitor has a camera of their own"
     other.close()

@@ -42,6 +42,8 @@ class Page:
         server.gui.configure_theme(**theme)
         server.gui.main_panel.dock_right()
         server.scene.set_up_direction("-y")
+        server.scene.configure_environment_map(None)  # without a graphics card it and shadows take most of the time
+        server.scene.configure_default_lights(cast_shadow=False)
         self._add_camera(engine)
         self._status = server.gui.add_markdown("")
         self._add_time(index)
