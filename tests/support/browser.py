@@ -1,4 +1,4 @@
-"""Headless Chromium as the viewer's tests use it: pictures that the page shows, counted and read in the browser."""
+"""Headless Chromium as the viewer's tests use it: images that the page shows, counted and read in the browser."""
 
 import shutil
 from collections.abc import Iterator
@@ -81,16 +81,16 @@ class Tab:
         route.abort()
 
     def times(self) -> NDArray[np.float64]:
-        """[N] ms, when pictures were shown."""
+        """[N] ms, when images were shown."""
         return np.array(self.page.evaluate("window.shown.map((each) => each[0])"), np.float64)
 
     def wait_for(self, width: int, more_than: int = 0) -> None:
-        """Until a picture of that width, px, is the last of more than so many that were shown."""
+        """Until a image of that width, px, is the last of more than so many that were shown."""
         shown = f"window.shown.length > {more_than} && window.shown[window.shown.length - 1][1] === {width}"
         self.page.wait_for_function(shown, timeout=60_000)
 
     def pixels(self) -> NDArray[np.uint8]:
-        """[H, W, 3] of the picture that was shown last."""
+        """[H, W, 3] of the image that was shown last."""
         (_, width, height), values = self.page.evaluate("[window.shown[window.shown.length - 1], window.pixels]")
         flat = np.array(values, np.uint8)
         return flat.reshape(int(height), int(width), 4)[..., :3]

@@ -22,7 +22,7 @@ def test_a_canvas_that_is_as_wide_as_the_source() -> None:
 
 
 def test_a_canvas_that_is_wider_than_the_picture() -> None:
-    """Then the picture is as high as the canvas: fy = 200 / 2."""
+    """Then the image is as high as the canvas: fy = 200 / 2."""
     view = view_of(Pose(UNTURNED, (0.0, 0.0, 0.0), math.pi / 2, 5.0), K, *SIZE)
     assert view.K is not None
     np.testing.assert_allclose(np.diag(view.K), [100, 100, 1])

@@ -69,7 +69,7 @@ def shown_view(viewer: Viewer, clip: vestcl.Clip) -> View:
 
 
 def middle(canvas: np.ndarray) -> np.ndarray:
-    """The picture without its bars."""
+    """The image without its bars."""
     bar = (canvas.shape[0] - HEIGHT) // 2
     return canvas[bar : bar + HEIGHT]
 

@@ -1,4 +1,4 @@
-"""The browser's camera as a view, its picture on the browser's canvas, and camera paths through keyframes.
+"""The browser's camera as a view, its image on the browser's canvas, and camera paths through keyframes.
 
 Cameras of the page have OpenCV's axes, as all of vestcl (x right, y down, z forward); the page's origin is the source
 camera at the time that is shown.
@@ -38,15 +38,15 @@ SOURCE: Final = View("source", np.eye(4))
 
 
 def view_of(pose: Pose, K: Matrix, height: int, width: int) -> View:
-    """The camera whose picture fills the canvas from side to side, or from top to bottom where that is nearer.
+    """The camera whose image fills the canvas from side to side, or from top to bottom where that is nearer.
 
-    f_y = H / (2 tan(fov / 2)) if the picture is as high as the canvas, f_x = W / (2 tan(fov / 2) aspect) if it is as
-    wide; f_x / f_y is the source's, and the centre is the picture's.
+    f_y = H / (2 tan(fov / 2)) if the image is as high as the canvas, f_x = W / (2 tan(fov / 2) aspect) if it is as
+    wide; f_x / f_y is the source's, and the centre is the image's.
 
     Args:
         pose: of the page's camera.
         K: [3, 3] px, of the source camera.
-        height: px, of the picture.
+        height: px, of the image.
         width: px.
     """
     turn = Rotation.from_quat(np.roll(np.asarray(pose.wxyz, np.float64), -1)).as_matrix()
@@ -75,20 +75,20 @@ def fov_of(K: Matrix, height: int, width: int, aspect: float) -> float:
     return 2 * math.atan(height / (2 * float(K[1, 1])))
 
 
-def on_canvas(picture: NDArray[np.uint8], aspect: float, shape: float = 1.0) -> NDArray[np.uint8]:
-    """The picture [H, W, 3] amid black bars, so that it has the canvas's aspect.
+def on_canvas(image: NDArray[np.uint8], aspect: float, shape: float = 1.0) -> NDArray[np.uint8]:
+    """The image [H, W, 3] between black bars, which give it the canvas's aspect.
 
     Args:
-        picture: RGB.
+        image: RGB.
         aspect: of the canvas.
         shape: f_y / f_x, by which its pixels are wider than high.
     """
-    height, width, _ = picture.shape
+    height, width, _ = image.shape
     if _fills_width(aspect, shape, height, width):
         bar = max(round((width * shape / aspect - height) / 2), 0)
-        return np.pad(picture, ((bar, bar), (0, 0), (0, 0)))
+        return np.pad(image, ((bar, bar), (0, 0), (0, 0)))
     bar = max(round((height * aspect / shape - width) / 2), 0)
-    return np.pad(picture, ((0, 0), (bar, bar), (0, 0)))
+    return np.pad(image, ((0, 0), (bar, bar), (0, 0)))
 
 
 def _fills_width(aspect: float, shape: float, height: int, width: int) -> bool:

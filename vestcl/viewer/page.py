@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.viewer import camera, pictures
+from vestcl.viewer import camera, images
 from vestcl.viewer.engine import Engine, Wanted
 from vestcl.viewer.motion import MOST_AHEAD, TICKS, Matrix
 from vestcl.viewer.renderer import Look
@@ -75,8 +75,8 @@ class Page:
         with gui.add_folder("Show"):
             self.method = gui.add_dropdown("method", methods, initial_value=methods[-1])
             self.preset = gui.add_dropdown("preset", LEVELS, initial_value=preset, disabled=len(methods) == 1)
-            self.colour = gui.add_dropdown("colours", pictures.COLOURS)
-            self.picture = gui.add_checkbox("picture", initial_value=True)
+            self.colour = gui.add_dropdown("colours", images.COLOURS)
+            self.image = gui.add_checkbox("image", initial_value=True)
             self.cameras = gui.add_checkbox("cameras", initial_value=True)
             self.velocities = gui.add_checkbox("velocities", initial_value=True)
             self.points = gui.add_checkbox("3D points", initial_value=False)
@@ -102,15 +102,15 @@ class Page:
         self.quit = gui.add_button("close the viewer")
 
     def on_change(self, changed: Callable[[], None]) -> None:
-        """Call ``changed`` when a control that `look` tells of does."""
-        controls = self.frame, self.ahead, self.method, self.preset, self.colour, self.picture
+        """Call ``changed`` when the user changes a control."""
+        controls = self.frame, self.ahead, self.method, self.preset, self.colour, self.image
         for control in (*controls, self.cameras, self.velocities, self.points):
             control.on_update(lambda _: changed())
 
     def look(self) -> Look:
         """What its controls say now."""
         wanted = Wanted(int(self.frame.value), self.method.value, self.preset.value)
-        return Look(wanted, float(self.ahead.value), self.colour.value, bool(self.picture.value))
+        return Look(wanted, float(self.ahead.value), self.colour.value, bool(self.image.value))
 
     def show_status(self, text: str) -> None:
         """A line on what is being done."""

@@ -1,4 +1,4 @@
-"""The thread that renders: coarse pictures while a camera moves, a full one when it is still, then panels and files."""
+"""The thread that renders: coarse images while a camera moves, a full one when it is still, then panels and files."""
 
 import collections
 import contextvars
@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.viewer import camera, pictures
+from vestcl.viewer import camera, images
 from vestcl.viewer.engine import Engine, Wanted
 from vestcl.viewer.scene import Scene
 
@@ -21,10 +21,10 @@ STILL: Final = 0.4
 #: Seconds without a movement before the panels are rendered.
 _PANELS_STILL: Final = 1.0
 
-#: Coarse pictures have each so-manieth row and column: the finest, and the coarsest.
+#: Coarse images have each n-th row and column: n of the finest, and of the coarsest.
 _STRIDES: Final = (2, 4)
 
-#: Seconds that a coarse picture may take; faster than the second, and the next is finer.
+#: Seconds that a coarse image may take; faster than the second, and the next is finer.
 _SLOW, _FAST = 0.075, 0.025
 
 _LOG: Final = logging.getLogger(__name__)
@@ -40,13 +40,13 @@ class Look(NamedTuple):
     ahead: float
     """Intervals after t."""
     colour: str
-    """One of `vestcl.viewer.pictures.COLOURS`."""
-    picture: bool
-    """Whether the rendered picture is shown."""
+    """One of `vestcl.viewer.images.COLOURS`."""
+    image: bool
+    """Whether the rendered image is shown."""
 
 
 class Screen(Protocol):
-    """What the renderer shows things on: the page."""
+    """What the renderer draws on: the page."""
 
     def look(self) -> Look:
         """What its controls say now."""
@@ -81,7 +81,7 @@ class Visitor:
 
 
 class Renderer:
-    """Serves all visitors from one thread: who moves comes first, then jobs, then full pictures, then the panels.
+    """Serves all visitors from one thread: who moves comes first, then jobs, then full images, then the panels.
 
     Args:
         engine: of the clip.
@@ -105,7 +105,7 @@ class Renderer:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread, after the picture that it renders."""
+        """End the thread, after the image that it renders."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -218,11 +218,11 @@ class Renderer:
         visitor.coarse_due = False
         start, pose = time.perf_counter(), visitor.pose()
         view = camera.view_of(pose, scene.K, *scene.size)
-        if not look.picture:
+        if not look.image:
             visitor.client.scene.set_background_image(None)
             return
         rendered = scene.render_coarse(look.ahead, view, self._stride)
-        self._send(visitor, scene, pictures.picture_of(rendered, look.colour), pose, "jpeg")
+        self._send(visitor, scene, images.pixels_of(rendered, look.colour), pose, "jpeg")
         taken, (finest, coarsest) = time.perf_counter() - start, _STRIDES
         if taken > _SLOW:
             self._stride = min(self._stride + 1, coarsest)
@@ -231,24 +231,24 @@ class Renderer:
 
     def _show_full(self, scene: Scene, look: Look, visitor: Visitor) -> None:
         visitor.full_due = False
-        if not look.picture:
+        if not look.image:
             return
         pose = visitor.pose()
         rendered = scene.render(look.ahead, camera.view_of(pose, scene.K, *scene.size))
-        self._send(visitor, scene, pictures.picture_of(rendered, look.colour), pose, "png")
+        self._send(visitor, scene, images.pixels_of(rendered, look.colour), pose, "png")
 
-    def _send(self, visitor: Visitor, scene: Scene, picture: NDArray[np.uint8], pose: camera.Pose, kind: str) -> None:
+    def _send(self, visitor: Visitor, scene: Scene, image: NDArray[np.uint8], pose: camera.Pose, kind: str) -> None:
         with self._changed:
             if visitor not in self.visitors.values():  # closed meanwhile
                 return
         shape = float(scene.K[1, 1] / scene.K[0, 0])
-        visitor.client.scene.set_background_image(camera.on_canvas(picture, pose.aspect, shape), format=kind)
+        visitor.client.scene.set_background_image(camera.on_canvas(image, pose.aspect, shape), format=kind)
         visitor.client.flush()
 
     def _panels(self, scene: Scene, look: Look) -> dict[str, NDArray[np.uint8]]:
         """Of the source camera."""
         rendered = scene.render(look.ahead, camera.SOURCE)
-        return pictures.panels(rendered, self.engine.truth(scene.index, look.ahead))
+        return images.panels(rendered, self.engine.truth(scene.index, look.ahead))
 
     def _do_job(self) -> None:
         with self._changed:

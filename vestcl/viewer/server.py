@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from vestcl.data.sample import Clip
 from vestcl.scene.inpainting.inpainters import Inpainter
-from vestcl.viewer import camera, pictures
+from vestcl.viewer import camera, images
 from vestcl.viewer.engine import Engine
 from vestcl.viewer.page import Page
 from vestcl.viewer.renderer import Job, Renderer
@@ -175,7 +175,7 @@ class Viewer:
         scene, look = current
         view = camera.view_of(visitor.pose(), scene.K, *scene.size)
         assert view.K is not None
-        content = pictures.file_of(scene.render(look.ahead, view), view.K, suffix)
+        content = images.file_of(scene.render(look.ahead, view), view.K, suffix)
         name = f"{_file_name(self.engine.clip.name)}_t{scene.index}_{look.ahead:+.1f}{suffix}"
         client.send_file_download(name, content, save_immediately=True)
 
@@ -185,15 +185,15 @@ class Viewer:
         if current is None or len(keyframes) < 2:
             raise ValueError(f"a camera path needs 2 keyframes or more, got {len(keyframes)}: add keyframe")
         scene, look = current
-        path, images = camera.camera_path(keyframes, max(round(float(self.page.seconds.value) * _FPS), 2)), []
+        path, frames = camera.camera_path(keyframes, max(round(float(self.page.seconds.value) * _FPS), 2)), []
         note = client.add_notification("camera path", "rendering ...", loading=True, with_close_button=False)
         try:
             for number, key in enumerate(path, 1):
                 rendered = scene.render(key.ahead, camera.view_of(key.pose, scene.K, *scene.size))
-                images.append(pictures.picture_of(rendered, look.colour))
+                frames.append(images.pixels_of(rendered, look.colour))
                 note.body = f"{number} of {len(path)} frames"
                 yield
-            content = pictures.video_of(images, _FPS, float(scene.K[1, 1] / scene.K[0, 0]))
+            content = images.video_of(frames, _FPS, float(scene.K[1, 1] / scene.K[0, 0]))
             client.send_file_download(f"{_file_name(self.engine.clip.name)}_path.mp4", content, save_immediately=True)
         finally:
             note.remove()

@@ -1,4 +1,4 @@
-"""What the viewer sends to the browser: pictures in a colour mode, panels, and files."""
+"""What the viewer sends to the browser: images in a colour mode, panels, and files."""
 
 import tempfile
 from collections.abc import Iterable
@@ -17,9 +17,9 @@ from vestcl.io.images import write_pixels
 from vestcl.io.ply import write_ply
 from vestcl.io.video.writing import write_mp4
 
-Picture = NDArray[np.uint8]
+Pixels = NDArray[np.uint8]
 
-#: What the picture shows.
+#: What the image shows.
 COLOURS: Final = ("colour", "depth", "coverage", "motion")
 Colour = Literal["colour", "depth", "coverage", "motion"]
 
@@ -30,7 +30,7 @@ _FASTEST: Final = 3.0
 _PANEL: Final = 480
 
 
-def picture_of(rendered: Rendered, colour: str) -> Picture:
+def pixels_of(rendered: Rendered, colour: str) -> Pixels:
     """[H, W, 3] RGB of a view: its colour, depth, coverage, or the length of its 3D motion.
 
     Args:
@@ -46,7 +46,7 @@ def picture_of(rendered: Rendered, colour: str) -> Picture:
     return rgb(rendered.image)
 
 
-def panels(rendered: Rendered, truth: NDArray[np.float32] | None) -> dict[str, Picture]:
+def panels(rendered: Rendered, truth: NDArray[np.float32] | None) -> dict[str, Pixels]:
     """The panels' images by name: truth and error are black where there is no truth.
 
     Args:
@@ -64,12 +64,12 @@ def panels(rendered: Rendered, truth: NDArray[np.float32] | None) -> dict[str, P
     return {name: _shrunk(image) for name, image in found.items()}
 
 
-def _shrunk(picture: Picture) -> Picture:
-    height, width, _ = picture.shape
+def _shrunk(image: Pixels) -> Pixels:
+    height, width, _ = image.shape
     if width <= _PANEL:
-        return picture
+        return image
     size = (_PANEL, max(round(height * _PANEL / width), 1))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def file_of(rendered: Rendered, K: NDArray[np.float64], suffix: str) -> bytes:
@@ -91,7 +91,7 @@ def file_of(rendered: Rendered, K: NDArray[np.float64], suffix: str) -> bytes:
         return path.read_bytes()
 
 
-def video_of(images: Iterable[Picture], fps: float, pixel_aspect: float) -> bytes:
+def video_of(images: Iterable[Pixels], fps: float, pixel_aspect: float) -> bytes:
     """An MP4's content; arguments as of `vestcl.io.video.writing.write_mp4`."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "path.mp4"
