@@ -52,7 +52,7 @@ setup(
         "pandas>=2.2.2",  # the first for numpy 2
         "pillow>=10.1",  # load_default(size)
         "pyopencl[pocl]>=2024.2.7",  # older ones warn with current pytools
-        "rich>=13",
+        "rich>=13.3.3",  # of viser
         "safetensors>=0.4.3",
         "scikit-image>=0.24",
         "scipy>=1.11.1",  # 1.11.0 was withdrawn

@@ -44,6 +44,7 @@ class Page:
         server.scene.set_up_direction("-y")
         server.scene.configure_environment_map(None)  # without a graphics card it and shadows take most of the time
         server.scene.configure_default_lights(cast_shadow=False)
+        server.scene.add_light_ambient("/light", intensity=2.0)
         self._add_camera(engine)
         self._status = server.gui.add_markdown("")
         self._add_time(index)
