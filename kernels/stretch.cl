@@ -1,10 +1,10 @@
-// How far apart the view shows the points of a picture's neighbouring pixels.
+// How far apart the view shows the points of an image's neighbouring pixels.
 //
 //   gap_d = |uv - uv of the neighbour in direction d|,   limit = TORN max(m, 1)
 //   h = min(gap_left, gap_right),  v = min(gap_above, gap_below),  each counts where it is below the limit,
 //   or where both of its gaps are below SLANTED m^2; there are two only inside the image
 //   r = (uv_right - uv_left) / 2,  d = (uv_below - uv_above) / 2: where |uv_right + uv_left - 2 uv| < BENT |r|, and so
-//   for d, the points are of one plane, and v = |r x d| / |r| if |r| < limit and v < max(limit, SLANTED m^2); h likewise
+//   for d, the points are of one plane, and v = |r x d| / |r| if |r| < limit and v < max(limit, SLANTED m^2); h too
 //   stretch = max(1, max(h, v) / m),   opacity = 1 where one of both counts, else 0
 //
 // Parallel over images, rows and chunks of a row, as unproject.
@@ -53,7 +53,7 @@ kernel void stretch(
   const int begin = get_global_id(0) * chunk, end = min(begin + chunk, width);
   const int row = get_global_id(1), b = get_global_id(2);
   const size_t first = ((size_t)b * height + row) * width;
-  const bool alone = height == 1 && width == 1;
+  const bool single = height == 1 && width == 1;
   // Beyond the first and the last row, a row's neighbour is the one on its other side: the nearer one is the same.
   const long above = row > 0 ? -(long)width : width, below = row + 1 < height ? width : -(long)width;
   for (int column = begin; column < end; column++) {
@@ -64,15 +64,15 @@ kernel void stretch(
     const REAL2 down = height > 1 ? gaps2(u, v, at + 2 * above, at + 2 * below) : (REAL2)INFINITY;
     const REAL limit = (REAL)TORN * (m < 1 ? 1 : m), slanted = (REAL)SLANTED * m * m;
     const REAL2 limit2 = (REAL2)(limit * limit, slanted * slanted);
-    const bool beside = across.x < limit2.x || (column > 0 && column + 1 < width && across.y < limit2.y);
+    const bool in_row = across.x < limit2.x || (column > 0 && column + 1 < width && across.y < limit2.y);
     const bool on = down.x < limit2.x || (row > 0 && row + 1 < height && down.y < limit2.y);
     const bool inside = column > 0 && column + 1 < width && row > 0 && row + 1 < height;
     const REAL2 lines = inside ? between_lines(at, width, limit2.x) : (REAL2)INFINITY;
     const REAL most = fmax(limit2.x, limit2.y);
-    const REAL h2 = lines.x < most ? lines.x : beside ? across.x : 0, v2 = lines.y < most ? lines.y : on ? down.x : 0;
+    const REAL h2 = lines.x < most ? lines.x : in_row ? across.x : 0, v2 = lines.y < most ? lines.y : on ? down.x : 0;
     const REAL widest = fmax(h2, v2);
     const REAL share = sqrt(widest) / (m < SMALLEST_PIXEL ? SMALLEST_PIXEL : m);
     factor[first + column] = share < 1 ? 1 : share;
-    opacity[first + column] = beside | on | alone;
+    opacity[first + column] = in_row | on | single;
   }
 }

@@ -1,8 +1,8 @@
 // The procedural street, seen by a pinhole camera. A pixel's ray is s (R K^-1) (u, v, 1), scaled so that s is its
 // z-depth; the nearest of the road plane and all solids gives depth and label, and its surface is shaded.
 //   project_solids  one work-item a solid: its rectangle on the image, and where its shadow falls on the road
-//   list_solids     one work-item a row of cells (image tiles, or squares of road): which rectangles touch each cell
-//   raycast         one work-item LANES pixels of a row: intersects its tile's solids LANES pixels at a time, then
+//   list_solids     one work-item per row of cells (image tiles, or squares of road): which rectangles touch each cell
+//   raycast         one work-item per LANES pixels of a row: intersects its tile's solids LANES pixels at a time, then
 //                   shades pixel by pixel, with a shadow ray through the solids of one square of road
 #include "common.h"
 #include "raycast_types.h"
@@ -13,7 +13,7 @@
 #define FLOATS float16
 #include "raycast_interval.h"
 #include "raycast_town.h"
-#include "raycast_things.h"
+#include "raycast_objects.h"
 #include "raycast_light.h"
 #include "raycast_normals.h"
 #include "raycast_trace.h"
@@ -130,7 +130,7 @@ static surface_t surface_of(const scene_t* scene, global const solid_t* solid, c
   }
 }
 
-// Linear light from what the ray hits at z-depth s: solid `id`, ROAD or SKY. It stands for `pixel` metres at 1 m.
+// Linear light from what the ray hits at z-depth s: solid `id`, ROAD or SKY. The ray is `pixel` metres wide at 1 m.
 static float3 colour_of(const scene_t* scene, float3 ray, float s, int id, float pixel)
 {
   global const view_t* view = scene->view;
@@ -152,7 +152,7 @@ static float3 colour_of(const scene_t* scene, float3 ray, float s, int id, float
 
 #ifdef BENT
 // Marks the pixels all of whose rays meet one smooth surface, and shades each once, by the centre's ray: textures are
-// filtered for the width that a ray stands for. Of a plane the mean of 1 / z over rays is that of the centre. Returns
+// filtered for the width of a ray. On a plane the mean of 1 / z over rays is that of the centre. Returns
 // whether these are all of the row.
 static bool shade_plain(
     const scene_t* scene, global const ushort* listed, int count, global const int4* image_rects, int y, int x0,
@@ -187,7 +187,7 @@ static bool shade_plain(
 }
 #endif
 
-// Depth, label and instance are of the ray through a pixel's centre. Colour is the mean over samples x samples rays a
+// Depth, label and instance are of the ray through a pixel's centre. Colour is the mean over samples x samples rays per
 // pixel in linear light, as a sensor sums it, and only then goes through the film curve: display() of a mean.
 kernel void raycast(
     const int height, const int width, const int tile_columns, const int solid_count, const int crossing_count,

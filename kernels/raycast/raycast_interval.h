@@ -3,10 +3,10 @@
 //   planes  n.(o + s d) <= c cuts s at (c - n.o) / (n.d): the last entry before the first exit
 //   sphere  around the ray's nearest point q = o + s0 d: s0 -+ sqrt((1 - |q|^2) / |d|^2), free of cancellation
 
-static void JOIN(clip_, FLOATS)(FLOATS along, float room, FLOATS* enter, FLOATS* exit)
+static void JOIN(clip_, FLOATS)(FLOATS along, float margin, FLOATS* enter, FLOATS* exit)
 {
   const FLOATS slope = select(along, (FLOATS)(TINY), fabs(along) < TINY);
-  const FLOATS s = room / slope;
+  const FLOATS s = margin / slope;
   *enter = max(*enter, select((FLOATS)(-INFINITY), s, slope < 0));
   *exit = min(*exit, select((FLOATS)(INFINITY), s, slope > 0));
 }

@@ -35,7 +35,7 @@ static float3 cloudy_sky(float3 ray, float3 sun, uint seed)
 }
 
 // (sunlight, daylight) that reach a point, 0 or 1 and in [0, 1]: a shadow ray through the solids of the cell where
-// the point's own shadow falls; daylight is dimmed on the ground beside and below a car.
+// the point's own shadow falls; daylight is dimmed on the ground next to and below a car.
 static float2 light_at(const scene_t* scene, float3 point, int own, bool ground)
 {
   const float3 sun = load3(scene->view->sun);

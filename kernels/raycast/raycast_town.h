@@ -126,10 +126,10 @@ static surface_t window(surface_t wall, float x, float y, float reach, float top
   const float goods = smoothstep(0.45f, 0.75f, heap) * band(y, 0, 1.6f, 0.5f);
   const float3 ware = (float3)(random(5, 6, key), random(7, 8, key), random(9, 10, key)) * 0.3f + 0.05f;
   const float3 lit = kind < 0.12f ? (float3)(0.30f, 0.21f, 0.10f) : (float3)(0.022f, 0.028f, 0.036f) * (0.6f + kind);
-  const float3 room = mix(shop ? (float3)(0.05f, 0.045f, 0.04f) : lit, ware, goods);
+  const float3 inside = mix(shop ? (float3)(0.05f, 0.045f, 0.04f) : lit, ware, goods);
   const float curtain = kind > 0.55f && !shop ? band(y, top - drop, top, footprint.y) : 0;
   const float recess = max(band(y, top - 0.2f, top, footprint.y), band(x, -reach, -reach + 0.13f, footprint.x));
-  float3 pane = mix(room, (float3)(0.42f, 0.41f, 0.37f) * (0.5f + 0.4f * kind), curtain);
+  float3 pane = mix(inside, (float3)(0.42f, 0.41f, 0.37f) * (0.5f + 0.4f * kind), curtain);
   pane = mix(pane * (1 - 0.6f * recess), (float3)(0.55f, 0.54f, 0.5f), bars);
   wall.albedo *= 1 - 0.22f * shade;
   wall.albedo = mix(wall.albedo, (float3)(0.46f, 0.44f, 0.40f), min(1.0f, sill + 0.6f * lintel));

@@ -19,7 +19,7 @@ typedef struct {
   float tint[3];  // linear RGB
   int shape, material, label;
   uint seed;
-  int instance;   // of what moves; 0 stands still
+  int instance;   // of dynamic objects; 0: static
 } solid_t;
 
 typedef struct {
@@ -27,7 +27,7 @@ typedef struct {
   float project[9];    // K R^T: a point to its homogeneous pixel
   float camera[3];     // where the camera is in the world; the road is y = 0
   float sun[3];        // unit vector towards it
-  float pixel;         // width of what one ray stands for at 1 m, metres
+  float pixel;         // width of one ray at 1 m, metres
   float lane, kerb;    // centre line to edge line and to kerb, metres
   float grid[2];       // x and z of the shadow grid's corner
   uint seed;
@@ -89,19 +89,19 @@ static place_t place_of(const scene_t* scene, float2 point)
     nearest = dot(apart, apart);
     best = i;
   }
-  float u = 0, v = 0, room = 1;
+  float u = 0, v = 0, scale = 1;
   for (int k = 0; k < NEWTON; k++) {
-    best = clamp(best + (int)round(u / (room * COURSE_STEP)), 0, scene->course_points - 1);
+    best = clamp(best + (int)round(u / (scale * COURSE_STEP)), 0, scene->course_points - 1);
     global const course_t* c = scene->course + best;
     const float2 apart = point - (float2)(c->place[0], c->place[1]);
     u = apart.x * c->ahead[0] + apart.y * c->ahead[1];
     v = apart.x * c->ahead[1] - apart.y * c->ahead[0];
-    room = max(1 - c->curvature * v, 0.3f);
+    scale = max(1 - c->curvature * v, 0.3f);
   }
   global const course_t* c = scene->course + best;
   const float2 unit = normalize(point);
   const float2 turned = (float2)(unit.x * c->ahead[1] - unit.y * c->ahead[0], unit.x * c->ahead[0] + unit.y * c->ahead[1]);
-  return (place_t){(float2)(v - 0.5f * c->curvature * u * u / room, c->along + u / room), fabs(turned)};
+  return (place_t){(float2)(v - 0.5f * c->curvature * u * u / scale, c->along + u / scale), fabs(turned)};
 }
 #else
 static place_t place_of(const scene_t* scene, float2 point)

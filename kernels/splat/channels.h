@@ -1,10 +1,10 @@
 // A row of CHANNELS numbers as BLOCKS vectors of VECTOR lanes. Where VECTOR does not divide CHANNELS the last
 // vector overlaps the one before by OVERLAP lanes, so that every access stays inside the row and is a whole vector.
-//   CHANNELS   numbers a row
+//   CHANNELS   numbers per row
 //   VECTOR     1, 4, 8 or 16 lanes, at most CHANNELS
 //   STREAM     1: rows are whole, aligned cache lines and VECTOR divides them; write them past the cache
 #ifndef CHANNELS
-#error "define CHANNELS, the number of features of a point"
+#error "define CHANNELS, the number of features per point"
 #endif
 #ifndef VECTOR
 #error "define VECTOR, the lanes of a vector of channels"

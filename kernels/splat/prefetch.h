@@ -10,6 +10,6 @@
 #endif
 #define PREFETCH(pointer) PREFETCH_AS(pointer, 0, 3)
 #define PREFETCH_TO_WRITE(pointer) PREFETCH_AS(pointer, 1, 3)
-// Not into the first-level cache, whose room is taken.
+// Not into the first-level cache, which is full.
 #define PREFETCH_FAR(pointer) PREFETCH_AS(pointer, 0, 2)
 #define CACHE_LINE 64

@@ -25,7 +25,8 @@ typedef struct { key_bits key, id; } entry_t;
 // One entry of a sorted tile list. box holds the footprint inside the tile, see pack_box.
 typedef struct { REAL u, v, r, o; int box, id; } record_t;
 
-// A footprint inside one tile, and whether the tile is the first of the point's to be walked back, see first_box.
+// A footprint inside one tile, and whether the tile is the first of the point's to be traversed backward, see
+// first_box.
 inline int pack_box(box_t box, bool first) {
   return box.x0 | box.x1 << 5 | box.y0 << 10 | box.y1 << 15 | (int)first << 20;
 }
@@ -90,12 +91,12 @@ inline bool drawable(REAL u, REAL v, REAL z, REAL r, REAL o) {
   return (u * 0 + v * 0 + z * 0 + r2 * 0 + o * 0 == 0) & (z >= (REAL)NEAR) & (r > 0) & (r2 >= SMALLEST);
 }
 
-// Where a point's fragments are, as a number: its first tile, and how many rows and columns of tiles it has more.
-// -1: in no list. MANY stands for MANY and above; the footprint then tells.
+// A point's tile intersections in one number: its first tile, and how many more rows and columns of tiles it covers.
+// -1: in no list. MANY means MANY or more; the footprint then gives the number.
 #define MORE_BITS 2
 #define MANY ((1 << MORE_BITS) - 1)
-inline int pack_place(int tile, int more_rows, int more_columns) {
+inline int pack_intersections(int tile, int more_rows, int more_columns) {
   return tile << 2 * MORE_BITS | smaller_of(more_rows, MANY) << MORE_BITS | smaller_of(more_columns, MANY);
 }
-inline int first_tile(int place) { return place >> 2 * MORE_BITS; }
-inline bool is_in_one_tile(int listed_place) { return (listed_place & ((1 << 2 * MORE_BITS) - 1)) == 0; }
+inline int first_tile(int packed) { return packed >> 2 * MORE_BITS; }
+inline bool is_in_one_tile(int packed) { return (packed & ((1 << 2 * MORE_BITS) - 1)) == 0; }

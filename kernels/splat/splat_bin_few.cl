@@ -13,21 +13,21 @@ kernel void list_few(
     global const REAL* restrict radii,        // [P]
     global const REAL* restrict opacities,    // [P]
     const int list_transparent,               // 0: points of opacity 0 are left out
-    global int* restrict places,              // [P] out: see pack_place
+    global int* restrict intersections,       // [P] out: see pack_intersections
     global int* restrict next,                // [B * tiles] scratch
     global entry_t* restrict entries,         // [P * tiles] scratch
     global entry_t* restrict scratch,         // [P * tiles] scratch
     global record_t* restrict records,        // [P * tiles] out
     global int* restrict tile_starts,         // [B * tiles + 1] out
-    global long* restrict tile_slots,         // [B * tiles] out: pixels of the quads of all footprints
-    global int* restrict span)                // [1] out: most tiles that a footprint covers along an axis
+    global long* restrict tile_scratch,       // [B * tiles] out: pixels of the quads of all footprints
+    global int* restrict extent)              // [1] out: most tiles that a footprint covers along an axis
 {
   const int tiles = tiles_y * tiles_x;
   int most = 1, begin = 0;
   for (int b = 0; b < batch; b++) {
     const range_t cloud = chunk_of(cloud_starts, 0, 1, b);
     const int covered = count_chunk(
-        cloud, height, width, tiles_y, tiles_x, points_uv, z, radii, opacities, list_transparent, places,
+        cloud, height, width, tiles_y, tiles_x, points_uv, z, radii, opacities, list_transparent, intersections,
         next + b * tiles);
     most = larger_of(most, covered);
     for (int t = b * tiles; t < (b + 1) * tiles; t++) {
@@ -35,13 +35,13 @@ kernel void list_few(
       tile_starts[t] = next[t] = begin;
       begin += count;
     }
-    fill_chunk(cloud, height, width, tiles_x, points_uv, z, radii, places, next + b * tiles, entries);
+    fill_chunk(cloud, height, width, tiles_x, points_uv, z, radii, intersections, next + b * tiles, entries);
   }
   tile_starts[batch * tiles] = begin;
-  *span = most;
+  *extent = most;
   for (int t = 0; t < batch * tiles; t++) {
     const int first = tile_starts[t];
-    tile_slots[t] = sort_tile(
+    tile_scratch[t] = sort_tile(
         t, tile_starts[t + 1] - first, tiles_y, tiles_x, height, width, smaller_of(most, tiles_y),
         smaller_of(most, tiles_x), points_uv, radii, opacities, entries + first, scratch + first, records + first);
   }

@@ -1,19 +1,19 @@
-// Compositing, one work-group a tile and one work-item a pixel: the mapping for GPUs. The formulas are those of
+// Compositing, one work-group per tile and one work-item per pixel: the mapping for GPUs. The formulas are those of
 // splat_composite.cl.
 //
 // Forward: the group stages GROUP points of the tile's list at a time in local memory, and each work-item composites
 // those that reach its pixel. Backward, three steps, none of which adds to what another work-item writes:
-//   1. each pixel walks its fragments forward and back and leaves w_i and dL/da_i in the slot of (entry, pixel),
-//   2. each entry sums over its slots; entries of a point in several tiles run in several launches, as in
-//      splat_composite.cl, so that each adds to the point's gradients alone,
+//   1. each pixel traverses its fragments forward and backward and writes w_i and dL/da_i to scratch at (entry, pixel),
+//   2. each entry sums over its pixels; entries of a point in several tiles run in several launches, as in
+//      splat_composite.cl, so that only one at a time adds to the point's gradients,
 //   3. each tile sums its pixels' share of the background's gradient.
 //
-//   CHANNELS         features of a point
+//   CHANNELS         features per point
 //   CHANNEL_GROUP    channels that one work-item of the forward keeps in registers
 #include "common.h"
 #include "splat.h"
 #ifndef CHANNELS
-#error "define CHANNELS, the number of features of a point"
+#error "define CHANNELS, the number of features per point"
 #endif
 #ifndef CHANNEL_GROUP
 #error "define CHANNEL_GROUP, the channels that a work-item composites"
@@ -35,7 +35,7 @@ inline void clear_row(global REAL* row) {
 #define EXISTS(d2, r2, t) ((d2) < (r2))
 #endif
 
-// One work-item a point: whether all its features are finite.
+// One work-item per point: whether all its features are finite.
 kernel void find_finite(const int points, global const REAL* restrict features, global int* restrict finite) {
   const int i = get_global_id(0);
   if (i >= points) return;
@@ -97,7 +97,7 @@ kernel void composite_pixels(
 }
 
 #ifdef GRAD_FEATURES
-inline int slot_in(box_t box, int x, int y) { return (y - box.y0) * (box.x1 - box.x0) + x - box.x0; }
+inline int offset_in(box_t box, int x, int y) { return (y - box.y0) * (box.x1 - box.x0) + x - box.x0; }
 
 // Step 1.
 kernel void composite_pixels_backward(
@@ -105,15 +105,15 @@ kernel void composite_pixels_backward(
     const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
     global const int* restrict tile_starts,     // [B * tiles + 1]
     global const record_t* restrict records,    // [E]
-    global const long* restrict tile_slot_starts,  // [B * tiles]
-    global const long* restrict slot_starts,    // [E], from there on
+    global const long* restrict tile_offsets,   // [B * tiles]
+    global const long* restrict entry_offsets,  // [E], from there on
     global const int* restrict finite,          // [P]
     global const REAL* restrict features,       // [P, C]
     global const REAL* restrict backgrounds,    // [B, C]
     global const REAL* restrict grad_image,     // [B, C, H, W] by strides
     global const REAL* restrict grad_coverage,  // [B, H, W]
-    global REAL* restrict slot_weights,         // [S] out: w_i
-    global REAL* restrict slot_grads,           // [S] out: dL/da_i
+    global REAL* restrict scratch_weights,      // [S] out: w_i
+    global REAL* restrict scratch_grads,        // [S] out: dL/da_i
     global REAL* restrict transmittance)        // [B, H, W] out: T_end
 {
   const int lane = get_local_id(0), index = get_group_id(0);
@@ -130,9 +130,9 @@ kernel void composite_pixels_backward(
     const REAL r2 = records[e].r * records[e].r;
     const bool exists = EXISTS(d2, r2, t) && finite[records[e].id];
     const REAL a = exists ? records[e].o - records[e].o / r2 * d2 : (REAL)0;
-    const size_t slot = tile_slot_starts[index] + slot_starts[e] + slot_in(box, column, line);
-    slot_weights[slot] = exists ? t : (REAL)0;
-    slot_grads[slot] = a;
+    const size_t offset = tile_offsets[index] + entry_offsets[e] + offset_in(box, column, line);
+    scratch_weights[offset] = exists ? t : (REAL)0;
+    scratch_grads[offset] = a;
     t *= 1 - a;
   }
   const size_t at = ((size_t)b * height + y) * width + x;
@@ -148,34 +148,34 @@ kernel void composite_pixels_backward(
   for (int e = end - 1; e >= begin; e--) {
     const box_t box = unpack_box(records[e].box);
     if (column < box.x0 || column >= box.x1 || line < box.y0 || line >= box.y1) continue;
-    const size_t slot = tile_slot_starts[index] + slot_starts[e] + slot_in(box, column, line);
-    const REAL before = slot_weights[slot], a = slot_grads[slot];
+    const size_t offset = tile_offsets[index] + entry_offsets[e] + offset_in(box, column, line);
+    const REAL before = scratch_weights[offset], a = scratch_grads[offset];
     if (a == 0 && before == 0) continue;
     REAL fg = 0;
     for (int c = 0; c < CHANNELS; c++)
       fg += features[(size_t)records[e].id * CHANNELS + c] * g[c * channel_stride];
-    slot_weights[slot] = a * before;
-    slot_grads[slot] = before * (fg - behind);
+    scratch_weights[offset] = a * before;
+    scratch_grads[offset] = before * (fg - behind);
     behind = a * fg + (1 - a) * behind;
   }
 }
 
 // Step 2, for the tiles (x0 + i * step_x, y0 + j * step_y): no two of them share a point.
-kernel void sum_slots(
+kernel void sum_scratch(
     const int height, const int width, const int tiles_y, const int tiles_x,
     const int x0, const int y0, const int step_x, const int step_y,
     const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
-    global const int* restrict tile_starts,     // [B * tiles + 1]
-    global const record_t* restrict records,    // [E]
-    global const long* restrict tile_slot_starts,  // [B * tiles]
-    global const long* restrict slot_starts,    // [E], from there on
-    global const REAL* restrict slot_weights,   // [S]
-    global const REAL* restrict slot_grads,     // [S]
-    global const REAL* restrict grad_image,     // [B, C, H, W] by strides
-    global REAL* restrict grad_features,        // [P, C] out
-    global REAL* restrict grad_points_uv,       // [P, 2] out
-    global REAL* restrict grad_radii,           // [P] out
-    global REAL* restrict grad_opacities)       // [P] out
+    global const int* restrict tile_starts,       // [B * tiles + 1]
+    global const record_t* restrict records,      // [E]
+    global const long* restrict tile_offsets,     // [B * tiles]
+    global const long* restrict entry_offsets,    // [E], from there on
+    global const REAL* restrict scratch_weights,  // [S]
+    global const REAL* restrict scratch_grads,    // [S]
+    global const REAL* restrict grad_image,       // [B, C, H, W] by strides
+    global REAL* restrict grad_features,          // [P, C] out
+    global REAL* restrict grad_points_uv,         // [P, 2] out
+    global REAL* restrict grad_radii,             // [P] out
+    global REAL* restrict grad_opacities)         // [P] out
 {
   const int lane = get_local_id(0);
   const int tx = x0 + (int)get_group_id(0) * step_x, ty = y0 + (int)get_group_id(1) * step_y, b = get_group_id(2);
@@ -185,7 +185,7 @@ kernel void sum_slots(
     const record_t point = records[e];
     const box_t box = unpack_box(point.box);
     const bool first = is_first(point.box);
-    const size_t slots = tile_slot_starts[index] + slot_starts[e];
+    const size_t start = tile_offsets[index] + entry_offsets[e];
     global const REAL* g = grad_image + b * image_stride + top * row_stride + left * pixel_stride;
 #if GRAD_FEATURES
     for (int c = 0; c < CHANNELS; c++) {
@@ -193,7 +193,7 @@ kernel void sum_slots(
       for (int y = box.y0; y < box.y1; y++)
         for (int x = box.x0; x < box.x1; x++) {
           const long pixel = y * row_stride + x * pixel_stride;
-          sum += slot_weights[slots + slot_in(box, x, y)] * g[pixel + c * channel_stride];
+          sum += scratch_weights[start + offset_in(box, x, y)] * g[pixel + c * channel_stride];
         }
       const size_t at = (size_t)point.id * CHANNELS + c;
       grad_features[at] = (first ? (REAL)0 : grad_features[at]) + sum;
@@ -203,7 +203,7 @@ kernel void sum_slots(
     REAL sum_da = 0, sum_dx = 0, sum_dy = 0, sum_d2 = 0;
     for (int y = box.y0; y < box.y1; y++)
       for (int x = box.x0; x < box.x1; x++) {
-        const REAL da = slot_grads[slots + slot_in(box, x, y)];
+        const REAL da = scratch_grads[start + offset_in(box, x, y)];
         const REAL dx = left + x + (REAL)0.5 - point.u, dy = top + y + (REAL)0.5 - point.v;
         sum_da += da;
         sum_dx += da * dx;
@@ -217,13 +217,13 @@ kernel void sum_slots(
   }
 }
 
-// Step 3, one work-item a channel of a tile.
+// Step 3, one work-item per channel of a tile.
 kernel void sum_tile_backgrounds(
     const int height, const int width, const int tiles_y, const int tiles_x,
     const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
-    global const REAL* restrict transmittance,       // [B, H, W]
-    global const REAL* restrict grad_image,          // [B, C, H, W] by strides
-    global REAL* restrict tile_grad_backgrounds)     // [B * tiles, C] out
+    global const REAL* restrict transmittance,    // [B, H, W]
+    global const REAL* restrict grad_image,       // [B, C, H, W] by strides
+    global REAL* restrict tile_grad_backgrounds)  // [B * tiles, C] out
 {
   const int c = get_global_id(0), index = get_global_id(1);
   const int b = index / (tiles_y * tiles_x);

@@ -1,4 +1,4 @@
-// What both mappings of the backward share: which gradients are computed, and those no tile computes alone.
+// What both mappings of the backward share: which gradients are computed, and those that need more than one tile.
 //   HAS_BACKGROUNDS, HAS_GRAD_COVERAGE   0 or 1: whether these are given, or all 0
 //   GRAD_FEATURES, GRAD_POINTS_UV, GRAD_RADII, GRAD_OPACITIES, GRAD_BACKGROUNDS   0 or 1
 #ifdef GRAD_FEATURES
@@ -27,11 +27,11 @@ inline void write_scalars(
 
 // The gradients of points that are in no tile become 0.
 inline void clear_unlisted(
-    int begin, int end, global const int* restrict places, global REAL* restrict grad_features,
+    int begin, int end, global const int* restrict intersections, global REAL* restrict grad_features,
     global REAL* restrict grad_points_uv, global REAL* restrict grad_radii, global REAL* restrict grad_opacities) {
   const point_grads_t none = {0, 0, 0, 0};
   for (int i = begin; i < end; i++) {
-    if (places[i] >= 0) continue;
+    if (intersections[i] >= 0) continue;
 #if GRAD_FEATURES
     clear_row(grad_features + (size_t)i * CHANNELS);
 #endif
@@ -42,13 +42,13 @@ inline void clear_unlisted(
 // One work-item a chunk of points.
 kernel void clear_gradients(
     const int points,
-    global const int* restrict places,   // [P], see splat_bin.cl
+    global const int* restrict intersections,  // [P], see splat_bin.cl
     global REAL* restrict grad_features, global REAL* restrict grad_points_uv, global REAL* restrict grad_radii,
     global REAL* restrict grad_opacities)
 {
   const int c = get_global_id(0), chunks = get_global_size(0);
   const int begin = (long)points * c / chunks, end = (long)points * (c + 1) / chunks;
-  clear_unlisted(begin, end, places, grad_features, grad_points_uv, grad_radii, grad_opacities);
+  clear_unlisted(begin, end, intersections, grad_features, grad_points_uv, grad_radii, grad_opacities);
 }
 
 // The gradient of a channel of an image's background: its tiles' gradients in order, with Kahan's compensation.
@@ -63,7 +63,7 @@ inline REAL sum_over_tiles(int b, int c, int tiles, global const REAL* tile_grad
   return sum;
 }
 
-// One work-item a channel of an image.
+// One work-item per channel of an image.
 kernel void sum_grad_backgrounds(
     const int tiles,
     global const REAL* restrict tile_grad_backgrounds,  // [B, tiles, C]

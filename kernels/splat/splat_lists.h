@@ -1,5 +1,5 @@
-// The steps from points to depth-sorted tile lists, for a chunk of points or a tile each: what splat_bin.cl shares out
-// between work-items, and splat_bin_few.cl does in one. After splat.h and prefetch.h.
+// The steps from points to depth-sorted tile lists, for one chunk of points or one tile: splat_bin.cl distributes
+// them over work-items, splat_bin_few.cl runs them in one. After splat.h and prefetch.h.
 //
 // Points whose tiles are found at a time, in a loop that compilers turn into vector code.
 #define STRIP 128
@@ -14,10 +14,10 @@ inline range_t chunk_of(global const int* cloud_starts, int c, int chunks, int b
   return chunk;
 }
 
-// How many rows and columns of tiles a point has more than one. x: columns, y: rows.
+// How many rows and columns of tiles a point covers beyond the first. x: columns, y: rows.
 inline int2 more_tiles(
-    int place, int i, int height, int width, global const REAL* points_uv, global const REAL* radii) {
-  const int2 more = (int2)(place & MANY, (place >> MORE_BITS) & MANY);
+    int packed, int i, int height, int width, global const REAL* points_uv, global const REAL* radii) {
+  const int2 more = (int2)(packed & MANY, (packed >> MORE_BITS) & MANY);
   if (more.x < MANY && more.y < MANY) return more;
   const box_t box = footprint(points_uv[2 * (size_t)i], points_uv[2 * (size_t)i + 1], radii[i], height, width);
   return (int2)((box.x1 - 1) / TILE - box.x0 / TILE, (box.y1 - 1) / TILE - box.y0 / TILE);
@@ -27,9 +27,9 @@ inline int2 more_tiles(
 inline int count_chunk(
     range_t chunk, int height, int width, int tiles_y, int tiles_x, global const REAL* restrict points_uv,
     global const REAL* restrict z, global const REAL* restrict radii, global const REAL* restrict opacities,
-    int list_transparent, global int* restrict places, global int* restrict counts) {
+    int list_transparent, global int* restrict intersections, global int* restrict counts) {
   for (int t = 0; t < tiles_y * tiles_x; t++) counts[t] = 0;
-  int span = 1;
+  int extent = 1;
   for (int strip = chunk.begin; strip < chunk.end; strip += STRIP) {
     const int end = smaller_of(strip + STRIP, chunk.end);
     for (int i = strip; i < end; i++) {
@@ -39,40 +39,40 @@ inline int count_chunk(
                         (list_transparent | (opacities[i] != 0));
       const int x = box.x0 / TILE, y = box.y0 / TILE;
       const int columns = (box.x1 - 1) / TILE - x, rows = (box.y1 - 1) / TILE - y;
-      span = larger_of(span, seen ? larger_of(columns, rows) + 1 : 1);
-      places[i] = seen ? pack_place(y * tiles_x + x, rows, columns) : -1;
+      extent = larger_of(extent, seen ? larger_of(columns, rows) + 1 : 1);
+      intersections[i] = seen ? pack_intersections(y * tiles_x + x, rows, columns) : -1;
     }
     for (int i = strip; i < end; i++) {
-      const int place = places[i];
-      if (place < 0) continue;
-      if (is_in_one_tile(place)) {
-        counts[first_tile(place)]++;
+      const int packed = intersections[i];
+      if (packed < 0) continue;
+      if (is_in_one_tile(packed)) {
+        counts[first_tile(packed)]++;
         continue;
       }
-      const int2 more = more_tiles(place, i, height, width, points_uv, radii);
+      const int2 more = more_tiles(packed, i, height, width, points_uv, radii);
       for (int y = 0; y <= more.y; y++)
-        for (int x = 0; x <= more.x; x++) counts[first_tile(place) + y * tiles_x + x]++;
+        for (int x = 0; x <= more.x; x++) counts[first_tile(packed) + y * tiles_x + x]++;
     }
   }
-  return span;
+  return extent;
 }
 
 // Write a chunk's points into the lists, tile t's from next[t] on.
 inline void fill_chunk(
     range_t chunk, int height, int width, int tiles_x, global const REAL* restrict points_uv,
-    global const REAL* restrict z, global const REAL* restrict radii, global const int* restrict places,
+    global const REAL* restrict z, global const REAL* restrict radii, global const int* restrict intersections,
     global int* restrict next, global entry_t* restrict entries) {
   for (int i = chunk.begin; i < chunk.end; i++) {
-    const int place = places[i];
-    if (place < 0) continue;
+    const int packed = intersections[i];
+    if (packed < 0) continue;
     const entry_t entry = {AS_KEY(z[i]), i};
-    if (is_in_one_tile(place)) {
-      entries[next[first_tile(place)]++] = entry;
+    if (is_in_one_tile(packed)) {
+      entries[next[first_tile(packed)]++] = entry;
       continue;
     }
-    const int2 more = more_tiles(place, i, height, width, points_uv, radii);
+    const int2 more = more_tiles(packed, i, height, width, points_uv, radii);
     for (int y = 0; y <= more.y; y++)
-      for (int x = 0; x <= more.x; x++) entries[next[first_tile(place) + y * tiles_x + x]++] = entry;
+      for (int x = 0; x <= more.x; x++) entries[next[first_tile(packed) + y * tiles_x + x]++] = entry;
   }
 }
 
@@ -155,11 +155,11 @@ inline long sort_tile(
   }
   sort_list(entries, scratch, n);
   const box_t firsts = first_box(top / TILE, left / TILE, step_y, step_x);
-  long slots = 0;
+  long size = 0;
   for (int i = 0; i < n; i++) {
     const record_t record = record_of(entries[i].id, top, left, height, width, firsts, points_uv, radii, opacities);
     records[i] = record;
-    slots += 4 * quads_in(unpack_box(record.box));
+    size += 4 * quads_in(unpack_box(record.box));
   }
-  return slots;
+  return size;
 }

@@ -1,14 +1,14 @@
-// The backward of compositing in one tile, for splat_composite.cl. After splat_walk.h.
+// The backward of compositing in one tile, for splat_composite.cl. After splat_traversal.h.
 #ifdef GRAD_FEATURES
 // What lies behind the last fragment of every pixel: A_end = b.g - h.
 inline void look_behind(
-    const vector_t g[ROOM][BLOCKS], tile_t tile, int height, int width, global const REAL* background_row,
+    const vector_t g[PADDED][BLOCKS], tile_t tile, int height, int width, global const REAL* background_row,
     global const REAL* grad_coverage, REAL* behind) {
-  for (int p = 0; p < ROOM; p++) behind[p] = 0;
+  for (int p = 0; p < PADDED; p++) behind[p] = 0;
 #if HAS_BACKGROUNDS
   vector_t background[BLOCKS];
   copy_row(background_row, background);
-  for (int p = 0; p < ROOM; p++) {
+  for (int p = 0; p < PADDED; p++) {
     vector_t products = 0;
 #pragma unroll
     for (int k = 0; k < BLOCKS; k++) products += background[k] * g[p][k];
@@ -25,7 +25,7 @@ inline void look_behind(
 
 // The tile's share of the background's gradient: T_end g summed over each row of pixels, then over the rows.
 inline void sum_background(
-    const vector_t g[ROOM][BLOCKS], const REAL* transmittance, tile_t tile, global REAL* grad_row) {
+    const vector_t g[PADDED][BLOCKS], const REAL* transmittance, tile_t tile, global REAL* grad_row) {
   vector_t total[BLOCKS];
   for (int k = 0; k < BLOCKS; k++) total[k] = 0;
   for (int y = 0; y < tile.height; y++) {
@@ -53,13 +53,13 @@ inline void clear_hidden(
   }
 }
 
-// Walk a segment's entries back to front, writing or adding to their points' gradients.
-inline void walk_back(
-    const walk_t* walk, const vector_t g[ROOM][BLOCKS], REAL* behind, int first, int stop, bool known_finite,
-    tile_t tile, global const record_t* records, global const REAL* features, global REAL* grad_features,
-    global REAL* grad_points_uv, global REAL* grad_radii, global REAL* grad_opacities) {
-  int slot = 0;
-  for (int e = first; e < stop; e++) slot += quads_in(unpack_box(records[e].box));
+// Traverse a segment's entries back to front, writing or adding to their points' gradients.
+inline void traverse_back(
+    const traversal_t* traversal, const vector_t g[PADDED][BLOCKS], REAL* behind, int first, int stop,
+    bool known_finite, tile_t tile, global const record_t* records, global const REAL* features,
+    global REAL* grad_features, global REAL* grad_points_uv, global REAL* grad_radii, global REAL* grad_opacities) {
+  int offset = 0;
+  for (int e = first; e < stop; e++) offset += quads_in(unpack_box(records[e].box));
   for (int e = stop - 1; e >= first; e--) {
     const int next = larger_of(e - AHEAD, first);
     read_ahead(records, next, features);
@@ -77,8 +77,8 @@ inline void walk_back(
       grad_f[k] = 0;
       if (!finite) f[k] = 0;
     }
-    slot -= quads_in(box);
-    const quad_t* quad = walk->quads + slot;
+    offset -= quads_in(box);
+    const quad_t* quad = traversal->quads + offset;
     REAL4 sum_da = 0, sum_dx = 0, sum_dy = 0, sum_d2 = 0;
     for (int y = box.y0; y < box.y1; y += 2)
       for (int x = box.x0; x < box.x1; x += 2, quad++) {
@@ -129,14 +129,14 @@ inline void composite_tile_backward(
     int index, int height, int width, int tiles_y, int tiles_x, REAL min_transmittance, strides_t strides,
     global const int* restrict tile_starts, global const record_t* restrict records,
     global const REAL* restrict features, global const REAL* restrict backgrounds,
-    global const int* restrict tile_walked, global const REAL* restrict grad_image,
+    global const int* restrict tile_traversed, global const REAL* restrict grad_image,
     global const REAL* restrict grad_coverage, global const int* restrict checkpoint_starts,
     global REAL* restrict checkpoints, global int* restrict checkpoint_entries, global REAL* restrict grad_features,
     global REAL* restrict grad_points_uv, global REAL* restrict grad_radii, global REAL* restrict grad_opacities,
     global REAL* restrict tile_grad_backgrounds) {
   const tile_t tile = tile_at(index, height, width, tiles_y, tiles_x);
-  const int begin = tile_starts[index], end = begin + entries_walked(tile_walked[index]);
-  const bool finite = all_finite(tile_walked[index]);
+  const int begin = tile_starts[index], end = begin + entries_traversed(tile_traversed[index]);
+  const bool finite = all_finite(tile_traversed[index]);
   clear_hidden(records, end, tile_starts[index + 1], grad_features, grad_points_uv, grad_radii, grad_opacities);
 #if !GRAD_BACKGROUNDS
   if (begin == end) return;
@@ -146,36 +146,37 @@ inline void composite_tile_backward(
   global const REAL* corner =
       grad_image + tile.b * strides.image + tile.top * strides.row + tile.left * strides.pixel;
   gradient_ahead_t ahead = gradient_ahead(tile, strides, corner);
-  walk_t walk;
-  for (int p = 0; p < ROOM; p++) walk.transmittance[p] = 1;
+  traversal_t traversal;
+  for (int p = 0; p < PADDED; p++) traversal.transmittance[p] = 1;
   int segment = 0, first = begin;
-  int stop = walk_forward(&walk, begin, end, finite, tile, min_transmittance, records, features, &ahead);
+  int stop = traverse_forward(&traversal, begin, end, finite, tile, min_transmittance, records, features, &ahead);
   while (stop < end) {
     const int at = checkpoint_starts[index] + ++segment;
     checkpoint_entries[at] = first = stop;
-    for (int p = 0; p < ROOM; p++) checkpoints[(size_t)at * ROOM + p] = walk.transmittance[p];
-    stop = walk_forward(&walk, first, end, finite, tile, min_transmittance, records, features, &ahead);
+    for (int p = 0; p < PADDED; p++) checkpoints[(size_t)at * PADDED + p] = traversal.transmittance[p];
+    stop = traverse_forward(&traversal, first, end, finite, tile, min_transmittance, records, features, &ahead);
   }
 
   for (int e = larger_of(stop - AHEAD, first); e < stop; e++) read_ahead(records, e, features);
-  vector_t g[ROOM][BLOCKS];
+  vector_t g[PADDED][BLOCKS];
   load_grad_image(g, tile, strides, corner);
 #if GRAD_BACKGROUNDS
-  sum_background(g, walk.transmittance, tile, tile_grad_backgrounds + (size_t)index * CHANNELS);
+  sum_background(g, traversal.transmittance, tile, tile_grad_backgrounds + (size_t)index * CHANNELS);
 #endif
 
   // Backward, segment by segment.
-  REAL behind[ROOM];
+  REAL behind[PADDED];
   look_behind(g, tile, height, width, backgrounds + (size_t)tile.b * CHANNELS, grad_coverage, behind);
   for (;;) {
-    walk_back(
-        &walk, g, behind, first, stop, finite, tile, records, features, grad_features, grad_points_uv, grad_radii,
+    traverse_back(
+        &traversal, g, behind, first, stop, finite, tile, records, features, grad_features, grad_points_uv, grad_radii,
         grad_opacities);
     if (segment == 0) break;
     const int at = checkpoint_starts[index] + --segment;
     first = segment == 0 ? begin : checkpoint_entries[at];
-    for (int p = 0; p < ROOM; p++) walk.transmittance[p] = segment == 0 ? (REAL)1 : checkpoints[(size_t)at * ROOM + p];
-    stop = walk_forward(&walk, first, end, finite, tile, min_transmittance, records, features, &ahead);
+    for (int p = 0; p < PADDED; p++)
+      traversal.transmittance[p] = segment == 0 ? (REAL)1 : checkpoints[(size_t)at * PADDED + p];
+    stop = traverse_forward(&traversal, first, end, finite, tile, min_transmittance, records, features, &ahead);
   }
 }
 #endif

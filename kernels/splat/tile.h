@@ -1,5 +1,5 @@
-// How a work-item walks one tile: in quads of 2 x 2 pixels, the lanes of a vector of four. After splat.h, channels.h.
-//   TRUNCATE   1: a pixel takes no more fragments once T < min_transmittance; 0: it takes all
+// How a work-item traverses one tile: in quads of 2 x 2 pixels, the lanes of a vector of four. After splat.h,
+// channels.h.   TRUNCATE   1: a pixel takes no more fragments once T < min_transmittance; 0: it takes all
 #ifndef TRUNCATE
 #error "define TRUNCATE as 0 or 1"
 #endif
@@ -9,10 +9,10 @@
 #define EXISTS(d2, r2, t) ((d2) < (r2))
 #endif
 
-// A footprint is walked in quads: pixels p, p + 1, p + STRIDE, p + STRIDE + 1. A quad may reach one pixel beyond its
+// A footprint is traversed in quads: pixels p, p + 1, p + STRIDE, p + STRIDE + 1. A quad may reach one pixel beyond its
 // footprint (where alpha is 0) and beyond the tile, into an apron that is never shown and has no gradient.
 #define STRIDE (TILE + 1)
-#define ROOM (STRIDE * STRIDE)
+#define PADDED (STRIDE * STRIDE)
 
 typedef struct { int b, left, top, width, height; } tile_t;
 
@@ -65,7 +65,7 @@ inline REAL4 quad_alphas(disc_t disc, int x, int y, REAL4 t, REAL min_transmitta
 }
 
 #ifdef GRAD_FEATURES
-// VECTOR numbers of one channel along a row of pixels, of which `count` exist; the others are anything.
+// VECTOR numbers of one channel along a row of pixels, of which `count` exist; the others are undefined.
 inline vector_t load_line(global const REAL* line, long pixel_stride, int count) {
   if (pixel_stride == 0) return *line;
   if (pixel_stride == 1 && count >= VECTOR) return *(global const loose_vector_t*)line;
@@ -77,7 +77,7 @@ inline vector_t load_line(global const REAL* line, long pixel_stride, int count)
 // Block k of the gradients at VECTOR pixels of a row, of which `count` are in the image, from channels that are not
 // next to each other: a line of pixels for each channel, transposed.
 inline void load_grad_lines(
-    vector_t grads[ROOM][BLOCKS], int k, int count, strides_t strides, global const REAL* pixel) {
+    vector_t grads[PADDED][BLOCKS], int k, int count, strides_t strides, global const REAL* pixel) {
   vector_t lines[VECTOR];
 #pragma unroll
   for (int lane = 0; lane < VECTOR; lane++) {
@@ -95,7 +95,7 @@ inline void load_grad_lines(
 
 // The gradients at the tile's pixels, 0 outside the image and in the apron. Lanes that overlap are 0, to count once
 // in a dot product.
-inline void load_grad_image(vector_t grads[ROOM][BLOCKS], tile_t tile, strides_t strides, global const REAL* corner) {
+inline void load_grad_image(vector_t grads[PADDED][BLOCKS], tile_t tile, strides_t strides, global const REAL* corner) {
   for (int y = 0; y < STRIDE; y++)
     for (int x = y < tile.height ? tile.width : 0; x < STRIDE; x++)
 #pragma unroll

@@ -89,7 +89,7 @@ def test_lists_of_a_raster(session: opencl.Session, monkeypatch: pytest.MonkeyPa
     def numbers() -> tuple[Any, ...]:
         raster = rasterize(**values)
         lists = raster.lists
-        return lists.tile_starts.tolist(), lists.tile_slots.tolist(), lists.steps, skipped(raster)
+        return lists.tile_starts.tolist(), lists.tile_scratch.tolist(), lists.steps, skipped(raster)
 
     few = numbers()
     monkeypatch.setattr(_splat_lists, "FEW_POINTS", 0)

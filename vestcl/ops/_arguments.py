@@ -21,7 +21,7 @@ Array = TypeVar("Array", torch.Tensor, np.ndarray)
 #: Ends the shape of an argument that may be None.
 OPTIONAL: Final = " | None"
 
-#: Points a work-item of a CPU walks through: long enough that its start (about 0.1 us) does not show, short
+#: Points per work-item on a CPU: long enough that its start (about 0.1 us) does not show, short
 #: enough that one frame (2e5 points) keeps 64 cores busy.
 CPU_CHUNK: Final = 2048
 
@@ -30,7 +30,7 @@ GPU_GROUP: Final = 64
 
 
 def check_arguments(**arguments: tuple[Any, str]) -> dict[str, int]:
-    """Hold operator arguments against their shapes; the sizes that the letters stand for.
+    """Hold operator arguments against their shapes; the sizes that the letters denote.
 
     Args:
         **arguments: name = (value, shape), with the shape as words: a number is that size, a letter must mean the
@@ -76,15 +76,15 @@ def _check_alike(name: str, value: Any, first: str, leader: Any) -> None:
 
 def _check_shape(name: str, got: list[int], words: list[str], sizes: dict[str, int], owners: dict[str, str]) -> None:
     """Compare one shape, and bind the letters that it is the first to use."""
-    wanted = f"[{', '.join(words)}]"
+    shape = f"[{', '.join(words)}]"
     if len(got) != len(words):
-        raise ValueError(f"`{name}` must be {wanted}, got {got}")
+        raise ValueError(f"`{name}` must be {shape}, got {got}")
     for word, size in zip(words, got, strict=True):
         if word.isdigit():
             if size != int(word):
-                raise ValueError(f"`{name}` must be {wanted}, got {got}")
+                raise ValueError(f"`{name}` must be {shape}, got {got}")
         elif size != sizes.setdefault(word, size):
-            raise ValueError(f"`{name}` must be {wanted} with {word} = {sizes[word]} as in `{owners[word]}`, got {got}")
+            raise ValueError(f"`{name}` must be {shape} with {word} = {sizes[word]} as in `{owners[word]}`, got {got}")
         else:
             owners.setdefault(word, name)
 
@@ -108,11 +108,11 @@ def _kind(value: torch.Tensor | np.ndarray) -> str:
 def check_starts(
     name: str, starts: torch.Tensor | np.ndarray, like: torch.Tensor | np.ndarray, total: int
 ) -> np.ndarray:
-    """A ragged list's ``<thing>_starts`` as a contiguous int64 array [n + 1].
+    """A ragged list's ``<name>_starts`` as a contiguous int64 array [n + 1].
 
     Args:
         name: the argument's name, for the messages.
-        starts: thing i owns the entries starts[i]:starts[i + 1].
+        starts: object i owns the entries starts[i]:starts[i + 1].
         like: the argument whose kind (torch or NumPy) ``starts`` must have.
         total: number of entries.
 
@@ -179,7 +179,7 @@ def as_array(value: torch.Tensor | np.ndarray) -> np.ndarray:
 
 
 class WorkItems(NamedTuple):
-    """How ``count`` equal things are shared out: work-item i takes [i * chunk, min((i + 1) * chunk, count))."""
+    """How ``count`` equal items are divided: work-item i takes [i * chunk, min((i + 1) * chunk, count))."""
 
     chunk: np.int32
     items: int
@@ -189,9 +189,9 @@ class WorkItems(NamedTuple):
 
 
 def work_items(session: opencl.Session, count: int) -> WorkItems:
-    """Work-items for ``count`` independent things: a chunk each on a CPU, one each on a GPU.
+    """Work-items for ``count`` independent items: a chunk each on a CPU, one each on a GPU.
 
-    For kernels whose work-items only walk on to the next result; a sum has its own split, the same on all devices.
+    For kernels whose work-items compute independent results; a sum has its own split, the same on all devices.
     """
     if session.mapping == "tile":
         return WorkItems(np.int32(CPU_CHUNK), -(-count // CPU_CHUNK), 1)

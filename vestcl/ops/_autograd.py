@@ -78,7 +78,7 @@ class _DifferentiableBy(torch.autograd.Function):
     def forward(
         ctx: Any, formula: Callable[..., Any], grads: Gradients, count: int, *tensors: torch.Tensor
     ) -> Gradients:
-        ctx.formula, ctx.count, ctx.wanted = formula, count, [grad is not None for grad in grads]
+        ctx.formula, ctx.count, ctx.needs_grad = formula, count, [grad is not None for grad in grads]
         ctx.save_for_backward(*tensors)
         return tuple(grad if grad is None else grad.clone() for grad in grads)  # two of them may be the same tensor
 
@@ -87,14 +87,14 @@ class _DifferentiableBy(torch.autograd.Function):
     def backward(ctx: Any, *grad_grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         again = torch.is_grad_enabled()
         with torch.enable_grad():
-            # Tensors of their own, for one tensor may have been passed twice.
+            # New tensors, for one tensor may have been passed twice.
             tensors = [
                 t.view_as(t) if again and t.requires_grad else t.detach().requires_grad_() for t in ctx.saved_tensors
             ]
             inputs, grad_outputs = tensors[: ctx.count], tensors[ctx.count :]
-            wanted = [tensor for tensor, is_wanted in zip(inputs, ctx.wanted, strict=True) if is_wanted]
-            grads = torch.autograd.grad(ctx.formula(*inputs), wanted, grad_outputs, create_graph=True)
-            upstream = [grad for grad, is_wanted in zip(grad_grads, ctx.wanted, strict=True) if is_wanted]
+            needed = [tensor for tensor, is_needed in zip(inputs, ctx.needs_grad, strict=True) if is_needed]
+            grads = torch.autograd.grad(ctx.formula(*inputs), needed, grad_outputs, create_graph=True)
+            upstream = [grad for grad, is_needed in zip(grad_grads, ctx.needs_grad, strict=True) if is_needed]
             second = torch.autograd.grad(grads, tensors, upstream, create_graph=again, allow_unused=True)
         return None, None, None, *second
 

@@ -1,4 +1,4 @@
-"""Launches of compositing, forward and backward, in both mappings: a work-item a tile, or a work-item a pixel."""
+"""Launches of compositing, forward and backward, in both mappings: one work-item per tile or per pixel."""
 
 import functools
 from collections.abc import Iterator, Mapping
@@ -23,7 +23,7 @@ _PIXELS: Final = "splat/splat_composite_pixels.cl"
 
 
 @dataclass(frozen=True)
-class Wanted:
+class NeedsGrad:
     """Which gradients `composite_backward` computes; the fields are the names of `splat`'s arguments."""
 
     points_uv: bool
@@ -33,7 +33,7 @@ class Wanted:
     backgrounds: bool
 
     def defines(self) -> dict[str, int]:
-        return {f"GRAD_{name.upper()}": int(wanted) for name, wanted in vars(self).items()}
+        return {f"GRAD_{name.upper()}": int(needed) for name, needed in vars(self).items()}
 
 
 @dataclass(frozen=True)
@@ -94,18 +94,18 @@ def _defines_of_tiles(dtype: np.dtype[Any], channels: int, truncates: bool, buil
 
 
 def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
-    """Image [B, H, W, C], coverage [B, H, W], and what the forward learnt for the backward, int32.
+    """Image [B, H, W, C], coverage [B, H, W], and what the forward saves for the backward, int32.
 
-    That is for the mapping "pixel" whether each point's features are finite [P], and for "tile" pack_walked of
-    kernels/splat/splat_walk.h [B * tiles].
+    For the mapping "pixel" that is whether each point's features are finite [P], for "tile" pack_traversed of
+    kernels/splat/splat_traversal.h [B * tiles].
     """
     geometry, lists = layer.geometry, layer.lists
     image = host_memory.empty((geometry.batch, geometry.height, geometry.width, layer.channels), layer.dtype)
     coverage = host_memory.empty(image.shape[:3], layer.dtype)
-    tiles = len(lists.tile_slots)
-    learnt = np.ones(geometry.points if layer.pixels else tiles, np.int32)
+    tiles = len(lists.tile_scratch)
+    saved = np.ones(geometry.points if layer.pixels else tiles, np.int32)
     if geometry.batch == 0:
-        return image, coverage, learnt
+        return image, coverage, saved
     with lists.session.job() as job:
         features = _read(job, layer.features)
         backgrounds = job.read(layer.backgrounds_or_zero())
@@ -114,33 +114,33 @@ def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
         if not layer.pixels:
             job.launch(
                 _TILES, "composite_tiles", layer.defines(), (tiles,),
-                [*layer.scalars(), *lists_read, features, backgrounds, *shown, job.write(learnt)],
+                [*layer.scalars(), *lists_read, features, backgrounds, *shown, job.write(saved)],
             )  # fmt: skip
-            return image, coverage, learnt
+            return image, coverage, saved
         defines = layer.defines()
-        learnt_written = job.write(learnt) if geometry.points else job.scratch(1, np.int32)
+        saved_buffer = job.write(saved) if geometry.points else job.scratch(1, np.int32)
         if geometry.points:
             count = np.int32(geometry.points)
-            job.launch(_PIXELS, "find_finite", defines, (geometry.points,), [count, features, learnt_written])
+            job.launch(_PIXELS, "find_finite", defines, (geometry.points,), [count, features, saved_buffer])
         job.launch(
             _PIXELS, "composite_pixels", defines, (tiles * _GROUP, -(-layer.channels // layer.channel_group)),
-            [*layer.scalars(), *lists_read, learnt_written, features, backgrounds, *shown],
+            [*layer.scalars(), *lists_read, saved_buffer, features, backgrounds, *shown],
             (_GROUP, 1),
         )  # fmt: skip
-    return image, coverage, learnt
+    return image, coverage, saved
 
 
 def composite_backward(
-    layer: Layer, learnt: Array, grad_image: Array, grad_coverage: Array | None, wanted: Wanted
+    layer: Layer, saved: Array, grad_image: Array, grad_coverage: Array | None, needs_grad: NeedsGrad
 ) -> dict[str, Array]:
-    """The wanted gradients, by name.
+    """The gradients that are needed, by name.
 
     Args:
         layer: as in the forward.
-        learnt: from the forward.
+        saved: from the forward.
         grad_image: [B, C, H, W] in any memory order, with any strides >= 0, such as 0 of what is expanded.
         grad_coverage: [B, H, W]; None is zero.
-        wanted: the gradients to compute.
+        needs_grad: the gradients to compute.
     """
     geometry = layer.geometry
     shapes = {
@@ -150,42 +150,44 @@ def composite_backward(
         "opacities": geometry.opacities.shape,
         "backgrounds": (geometry.batch, layer.channels),
     }
-    grads = {name: host_memory.empty(shape, layer.dtype) for name, shape in shapes.items() if getattr(wanted, name)}
+    grads = {name: host_memory.empty(shape, layer.dtype) for name, shape in shapes.items() if getattr(needs_grad, name)}
     if geometry.batch == 0:
         return grads
     has = {"HAS_BACKGROUNDS": int(layer.backgrounds is not None), "HAS_GRAD_COVERAGE": int(grad_coverage is not None)}
-    defines = {**layer.defines(), **wanted.defines(), **has}
+    defines = {**layer.defines(), **needs_grad.defines(), **has}
     file, launch = (_PIXELS, _launch_pixels_backward) if layer.pixels else (_TILES, _launch_tiles_backward)
     with layer.lists.session.job() as job:
         none = job.scratch(1, layer.dtype)
         *outputs, backgrounds = (job.write(grads[n]) if n in grads and grads[n].size else none for n in shapes)
-        per_tile = job.scratch(len(layer.lists.tile_slots) * layer.channels if wanted.backgrounds else 1, layer.dtype)
+        per_tile = job.scratch(
+            len(layer.lists.tile_scratch) * layer.channels if needs_grad.backgrounds else 1, layer.dtype
+        )
         if _is_little(layer):
             both = [per_tile, backgrounds]
-            _launch_few_backward(job, layer, defines, learnt, grad_image, grad_coverage, outputs, both)
+            _launch_few_backward(job, layer, defines, saved, grad_image, grad_coverage, outputs, both)
             return grads
         if geometry.points:
-            clear: list[opencl.Argument] = [np.int32(geometry.points), layer.lists.places, *outputs]
+            clear: list[opencl.Argument] = [np.int32(geometry.points), layer.lists.intersections, *outputs]
             chunks = chunks_of(layer.lists.session, geometry.points, 1)
             job.launch(file, "clear_gradients", defines, (chunks,), clear)
-        launch(job, layer, defines, learnt, grad_image, grad_coverage, outputs, per_tile)
-        if wanted.backgrounds:
+        launch(job, layer, defines, saved, grad_image, grad_coverage, outputs, per_tile)
+        if needs_grad.backgrounds:
             total: list[opencl.Argument] = [np.int32(geometry.tiles), per_tile, backgrounds]
             job.launch(file, "sum_grad_backgrounds", defines, (layer.channels, geometry.batch), total)
     return grads
 
 
 def _is_little(layer: Layer) -> bool:
-    tiles = len(layer.lists.tile_slots)
+    tiles = len(layer.lists.tile_scratch)
     little = tiles <= FEW_TILES and tiles * layer.channels <= FEW_NUMBERS
     return little and are_few(layer.lists.session, layer.geometry)
 
 
 def _launch_tiles_backward(
-    job: opencl.Job, layer: Layer, defines: dict[str, str | int], learnt: Array, grad_image: Array,
+    job: opencl.Job, layer: Layer, defines: dict[str, str | int], saved: Array, grad_image: Array,
     grad_coverage: Array | None, outputs: list[opencl.Buffer], per_tile: opencl.Buffer,
 ) -> None:  # fmt: skip
-    scalars, inputs = _tiles_backward_inputs(job, layer, learnt, grad_image, grad_coverage)
+    scalars, inputs = _tiles_backward_inputs(job, layer, saved, grad_image, grad_coverage)
     for phase, count in _phases(layer):
         job.launch(
             _TILES, "composite_tiles_backward", defines, count,
@@ -194,11 +196,11 @@ def _launch_tiles_backward(
 
 
 def _launch_few_backward(
-    job: opencl.Job, layer: Layer, defines: dict[str, str | int], learnt: Array, grad_image: Array,
+    job: opencl.Job, layer: Layer, defines: dict[str, str | int], saved: Array, grad_image: Array,
     grad_coverage: Array | None, outputs: list[opencl.Buffer], backgrounds: list[opencl.Buffer],
 ) -> None:  # fmt: skip
-    scalars, inputs = _tiles_backward_inputs(job, layer, learnt, grad_image, grad_coverage)
-    inputs.insert(2, layer.lists.places)
+    scalars, inputs = _tiles_backward_inputs(job, layer, saved, grad_image, grad_coverage)
+    inputs.insert(2, layer.lists.intersections)
     step_y, step_x = layer.lists.steps
     sizes = [np.int32(n) for n in (layer.geometry.batch, layer.geometry.points, step_x, step_y)]
     job.launch(
@@ -208,18 +210,18 @@ def _launch_few_backward(
 
 
 def _tiles_backward_inputs(
-    job: opencl.Job, layer: Layer, learnt: Array, grad_image: Array, grad_coverage: Array | None
+    job: opencl.Job, layer: Layer, saved: Array, grad_image: Array, grad_coverage: Array | None
 ) -> tuple[list[np.int64], list[opencl.Buffer]]:
     """The strides of the image's gradient, and what the backward by tiles reads, and scratch memory for checkpoints."""
     lists = layer.lists
     strides, grad_image = _strides(lists.session, grad_image)
     # A segment but the last has room for less than one more footprint, which bounds their number.
-    segments = 1 + lists.tile_slots // (constants.SEGMENT - _GROUP)
+    segments = 1 + lists.tile_scratch // (constants.SEGMENT - _GROUP)
     checkpoint_starts = (np.cumsum(segments) - segments).astype(np.int32)
     checkpoints = int(segments.sum()) if segments.max(initial=1) > 1 else 1
     inputs = [
         job.read(lists.tile_starts), lists.records, _read(job, layer.features),
-        _read(job, layer.backgrounds), job.read(learnt), job.read(grad_image), _read(job, grad_coverage),
+        _read(job, layer.backgrounds), job.read(saved), job.read(grad_image), _read(job, grad_coverage),
         job.read(checkpoint_starts),
         job.scratch(checkpoints * (constants.TILE + 1) ** 2, layer.dtype), job.scratch(checkpoints, np.int32),
     ]  # fmt: skip
@@ -227,27 +229,27 @@ def _tiles_backward_inputs(
 
 
 def _launch_pixels_backward(
-    job: opencl.Job, layer: Layer, defines: dict[str, str | int], learnt: Array, grad_image: Array,
+    job: opencl.Job, layer: Layer, defines: dict[str, str | int], saved: Array, grad_image: Array,
     grad_coverage: Array | None, outputs: list[opencl.Buffer], per_tile: opencl.Buffer,
 ) -> None:  # fmt: skip
     geometry, lists = layer.geometry, layer.lists
     strides, grad_image = _strides(lists.session, grad_image)
-    tiles = len(lists.tile_slots)
-    starts = job.read(np.cumsum(lists.tile_slots) - lists.tile_slots)
-    weights, slot_grads = (job.scratch(int(lists.tile_slots.sum()), layer.dtype) for _ in range(2))
+    tiles = len(lists.tile_scratch)
+    starts = job.read(np.cumsum(lists.tile_scratch) - lists.tile_scratch)
+    weights, scratch_grads = (job.scratch(int(lists.tile_scratch.sum()), layer.dtype) for _ in range(2))
     transmittance = job.scratch(geometry.batch * geometry.height * geometry.width, layer.dtype)
     grad = job.read(grad_image)
-    entries = [job.read(lists.tile_starts), lists.records, starts, lists.slot_starts]
+    entries = [job.read(lists.tile_starts), lists.records, starts, lists.entry_offsets]
     job.launch(
         _PIXELS, "composite_pixels_backward", defines, (tiles * _GROUP,),
-        [*layer.scalars(), *strides, *entries, _read(job, learnt), _read(job, layer.features),
-         _read(job, layer.backgrounds), grad, _read(job, grad_coverage), weights, slot_grads, transmittance],
+        [*layer.scalars(), *strides, *entries, _read(job, saved), _read(job, layer.features),
+         _read(job, layer.backgrounds), grad, _read(job, grad_coverage), weights, scratch_grads, transmittance],
         (_GROUP,),
     )  # fmt: skip
     for phase, (columns, rows, batch) in _phases(layer):
         job.launch(
-            _PIXELS, "sum_slots", defines, (columns * _GROUP, rows, batch),
-            [*geometry.sizes, *phase, *strides, *entries, weights, slot_grads, grad, *outputs],
+            _PIXELS, "sum_scratch", defines, (columns * _GROUP, rows, batch),
+            [*geometry.sizes, *phase, *strides, *entries, weights, scratch_grads, grad, *outputs],
             (_GROUP, 1, 1),
         )  # fmt: skip
     if defines["GRAD_BACKGROUNDS"]:

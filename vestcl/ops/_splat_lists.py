@@ -68,29 +68,29 @@ class TileLists:
     session: opencl.Session
     tile_starts: Array
     """[B * tiles + 1] int32."""
-    tile_slots: Array
-    """[B * tiles] int64: room that the backward needs, in pixels of all footprints inside the tile."""
-    span: Array
+    tile_scratch: Array
+    """[B * tiles] int64: scratch memory of the backward, in pixels of all footprints inside the tile."""
+    extent: Array
     """[] int32: most tiles that a footprint covers along an axis. Like the arrays above, known when the job is done."""
     grid: tuple[int, int]
     """Rows and columns of tiles."""
     records: opencl.Buffer
     """[E] record_t of kernels/splat/splat.h."""
-    places: opencl.Buffer
-    """[P] int32: the tiles of each point, see pack_place in kernels/splat/splat.h."""
-    slot_starts: opencl.Buffer
-    """[E] int64: an entry's first slot in its tile; only the mapping "pixel" has it."""
+    intersections: opencl.Buffer
+    """[P] int32: the tile intersections of each point, see pack_intersections in kernels/splat/splat.h."""
+    entry_offsets: opencl.Buffer
+    """[E] int64: offset of an entry's first pixel in its tile's scratch; empty for the mapping "tile"."""
 
     @property
     def steps(self) -> tuple[int, int]:
         """Rows and columns of tiles from one tile to the next that certainly share no point."""
-        return _steps(self.span, self.grid)
+        return _steps(self.extent, self.grid)
 
 
 def chunks_of(session: opencl.Session, points: int, counters: int) -> int:
-    """Work-items that share ``points``, each with ``counters`` numbers of its own. No result depends on it."""
-    wanted = CHUNKS_PER_UNIT * session.info.compute_units if session.mapping == "tile" else points // GPU_CHUNK
-    return max(1, min(wanted, MAX_COUNTERS // counters))
+    """Work-items that share ``points``, with ``counters`` numbers each. No result depends on it."""
+    chunks = CHUNKS_PER_UNIT * session.info.compute_units if session.mapping == "tile" else points // GPU_CHUNK
+    return max(1, min(chunks, MAX_COUNTERS // counters))
 
 
 def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
@@ -100,11 +100,11 @@ def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
     if are_few(session, geometry):
         return _list_few(session, geometry, defines)
     with session.job() as job:
-        places = job.scratch(geometry.points, np.int32)
+        intersections = job.scratch(geometry.points, np.int32)
         if geometry.points == 0:
-            return _sort(job, geometry, _starts(tile_counts), np.ones((), np.int32), places, None)
+            return _sort(job, geometry, _starts(tile_counts), np.ones((), np.int32), intersections, None)
         chunks = chunks_of(session, geometry.points // geometry.batch, geometry.tiles * geometry.batch)
-        spans = np.ones((geometry.batch, chunks), np.int32)
+        extents = np.ones((geometry.batch, chunks), np.int32)
         starts, points_uv, z, radii, opacities = (
             job.read(array)
             for array in (geometry.cloud_starts, geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
@@ -113,7 +113,8 @@ def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
         counts = job.scratch(geometry.batch * chunks * geometry.tiles, np.int32)
         job.launch(
             "splat/splat_bin.cl", "count_tiles", defines, (chunks, geometry.batch),
-            [*geometry.sizes, starts, points_uv, z, radii, opacities, transparent, places, counts, job.write(spans)],
+            [*geometry.sizes, starts, points_uv, z, radii, opacities, transparent, intersections, counts,
+             job.write(extents)],
         )  # fmt: skip
         job.launch(
             "splat/splat_bin.cl", "scan_chunks", defines, (geometry.tiles, geometry.batch),
@@ -124,9 +125,9 @@ def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
         entries = job.scratch(int(tile_starts[-1]), _entry_type(geometry))
         job.launch(
             "splat/splat_bin.cl", "fill_tiles", defines, (chunks, geometry.batch),
-            [*geometry.sizes, starts, points_uv, z, radii, places, job.read(tile_starts), counts, entries],
+            [*geometry.sizes, starts, points_uv, z, radii, intersections, job.read(tile_starts), counts, entries],
         )  # fmt: skip
-        return _sort(job, geometry, tile_starts, spans.max(), places, entries)
+        return _sort(job, geometry, tile_starts, extents.max(), intersections, entries)
 
 
 def are_few(session: opencl.Session, geometry: Geometry) -> bool:
@@ -138,26 +139,26 @@ def are_few(session: opencl.Session, geometry: Geometry) -> bool:
 def _list_few(session: opencl.Session, geometry: Geometry, defines: dict[str, str | int]) -> TileLists:
     """`list_tiles` by one work-item; the lists are allocated for all points in all tiles."""
     tiles, pairs = geometry.batch * geometry.tiles, geometry.points * geometry.tiles
-    tile_starts, tile_slots, span = np.empty(tiles + 1, np.int32), np.empty(tiles, np.int64), np.empty((), np.int32)
+    tile_starts, tile_scratch, extent = np.empty(tiles + 1, np.int32), np.empty(tiles, np.int64), np.empty((), np.int32)
     with session.job() as job:
         arrays = (geometry.cloud_starts, geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
-        places, counts = job.scratch(geometry.points, np.int32), job.scratch(tiles, np.int32)
+        intersections, counts = job.scratch(geometry.points, np.int32), job.scratch(tiles, np.int32)
         entries, scratch = (job.scratch(pairs, _entry_type(geometry)) for _ in range(2))
         records = job.scratch(pairs, _record_type(geometry))
         scalars, transparent = [*geometry.sizes, np.int32(geometry.batch)], np.int32(geometry.list_transparent)
         job.launch(
             "splat/splat_bin_few.cl", "list_few", defines, (1,),
             [*scalars, *(job.read(array) for array in arrays), transparent,
-             places, counts, entries, scratch, records,
-             *(job.write(array) for array in (tile_starts, tile_slots, span))],
+             intersections, counts, entries, scratch, records,
+             *(job.write(array) for array in (tile_starts, tile_scratch, extent))],
         )  # fmt: skip
         none = job.scratch(0, np.int64)
-        return TileLists(session, tile_starts, tile_slots, span, geometry.grid, records, places, none)
+        return TileLists(session, tile_starts, tile_scratch, extent, geometry.grid, records, intersections, none)
 
 
-def _steps(span: Array, grid: tuple[int, int]) -> tuple[int, int]:
+def _steps(extent: Array, grid: tuple[int, int]) -> tuple[int, int]:
     rows, columns = grid
-    return min(int(span), rows), min(int(span), columns)
+    return min(int(extent), rows), min(int(extent), columns)
 
 
 def _defines(session: opencl.Session, geometry: Geometry) -> dict[str, str | int]:
@@ -184,29 +185,31 @@ def _sort(
     job: opencl.Job,
     geometry: Geometry,
     tile_starts: Array,
-    span: Array,
-    places: opencl.Buffer,
+    extent: Array,
+    intersections: opencl.Buffer,
     entries: opencl.Buffer | None,
 ) -> TileLists:
     """Sort every tile's entries by (z, index) into records. Without points there is nothing to sort."""
     count, tiles = int(tile_starts[-1]), len(tile_starts) - 1
-    steps = _steps(span, geometry.grid)
+    steps = _steps(extent, geometry.grid)
     together = job.session.mapping == "pixel"
     records = job.scratch(count, _record_type(geometry))
-    slot_starts = job.scratch(count if together else 0, np.int64)
-    tile_slots = np.zeros(tiles, np.int64)
+    entry_offsets = job.scratch(count if together else 0, np.int64)
+    tile_scratch = np.zeros(tiles, np.int64)
     if entries is not None and count:
         arrays = (tile_starts, geometry.points_uv, geometry.radii, geometry.opacities)
         scratch = job.scratch(count, _entry_type(geometry))
         arguments: list[opencl.Argument] = [*geometry.sizes, *map(np.int32, steps), *map(job.read, arrays)]
-        arguments += [entries, scratch, records, job.write(tile_slots)]
+        arguments += [entries, scratch, records, job.write(tile_scratch)]
         defines = _defines(job.session, geometry)
         if together:
             group = constants.TILE**2
             job.launch(
                 "splat/splat_bin.cl", "sort_tiles_together", defines | {"TOGETHER": 1}, (tiles * group,),
-                [*arguments, slot_starts], (group,),
+                [*arguments, entry_offsets], (group,),
             )  # fmt: skip
         else:
             job.launch("splat/splat_bin.cl", "sort_tiles", defines, (tiles,), arguments)
-    return TileLists(job.session, tile_starts, tile_slots, span, geometry.grid, records, places, slot_starts)
+    return TileLists(
+        job.session, tile_starts, tile_scratch, extent, geometry.grid, records, intersections, entry_offsets
+    )

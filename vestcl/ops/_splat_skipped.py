@@ -23,7 +23,7 @@ class Skipped:
     behind: int
     """Points nearer than `constants.NEAR`, 0.1 m."""
     no_radius: int
-    """Points whose radius is <= 0 or whose squared radius is no normal number."""
+    """Points whose radius is <= 0 or whose squared radius is subnormal or infinite."""
     outside: int
     """Points whose footprint holds no pixel of the image."""
     transparent: int
@@ -54,6 +54,6 @@ def count_culled(geometry: Geometry, lists: TileLists) -> dict[str, int]:
     with lists.session.job() as job:
         job.launch(
             "splat/splat_skipped.cl", "count_skipped", defines, (len(counts),),
-            [*sizes, *map(job.read, arrays), lists.places, job.write(counts)],
+            [*sizes, *map(job.read, arrays), lists.intersections, job.write(counts)],
         )  # fmt: skip
     return {reason: int(count) for reason, count in zip(REASONS, counts.sum(axis=0), strict=True)}

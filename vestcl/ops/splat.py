@@ -9,7 +9,7 @@ import torch
 from vestcl import constants, opencl
 from vestcl.ops._arguments import Array, as_array, check_arguments, check_starts, require_no_grad, require_ordinary
 from vestcl.ops._autograd import Gradients, differentiable_once, untraced
-from vestcl.ops._splat_composite import Layer, Wanted, composite_backward, composite_forward
+from vestcl.ops._splat_composite import Layer, NeedsGrad, composite_backward, composite_forward
 from vestcl.ops._splat_lists import Geometry, TileLists, list_tiles
 from vestcl.ops._splat_skipped import Skipped, count_culled
 
@@ -69,9 +69,9 @@ def splat(
         T_0 = 1,   w_i = a_i T_i,   T_(i+1) = T_i (1 - a_i)   in the order (z, index)
         image = sum_i w_i f_i + T_end b,   coverage = 1 - T_end
 
-    Exact: any number of fragments a pixel, no epsilon, no division by 1 - a in the gradient, the same bits on any
-    number of cores. Points with z < 0.1 m, a radius <= 0 (or so extreme that its square is no normal number) or any
-    number that is not finite (a feature counts) are skipped, and their gradients are 0; so are points of opacity 0
+    Exact: any number of fragments per pixel, no epsilon, no division by 1 - a in the gradient, the same bits on any
+    number of cores. Points with z < 0.1 m, a radius <= 0 (or so extreme that its square is subnormal or infinite) or
+    any number that is not finite (a feature counts) are skipped, and their gradients are 0; so are points of opacity 0
     unless the gradient of the opacities is asked for. `skipped` counts them.
 
     Clouds of different sizes cost no padding when they are packed: concatenate the points of all clouds (without the
@@ -81,9 +81,9 @@ def splat(
     Args:
         points_uv: [B, N, 2] px, pixel centres at (column + 0.5, row + 0.5). Torch CPU tensor or NumPy array of
             float32 or float64, any strides; the others are of the same kind and dtype.
-        z: [B, N] m, z-depth, for the order alone.
+        z: [B, N] m, z-depth, only for the order.
         radii: [B, N] px.
-        opacities: [B, N], meant to be in [0, 1]; the formula is used as it stands outside.
+        opacities: [B, N], meant to be in [0, 1]; outside, the formula is used unchanged.
         features: [B, N, C], 1 <= C <= 1024.
         height: rows of the image.
         width: columns of the image.
@@ -217,7 +217,7 @@ def skipped(raster: Raster[Array], min_transmittance: float = 0.0) -> Skipped:
     return Skipped(
         **count_culled(geometry, lists),
         points=geometry.points,
-        tiles=len(lists.tile_slots),
+        tiles=len(lists.tile_scratch),
         empty_tiles=int((np.diff(lists.tile_starts) == 0).sum()),
         pixels=left.size,
         saturated_pixels=int(((left == 0) | (left < min_transmittance)).sum()),
@@ -238,7 +238,7 @@ class _Composite(torch.autograd.Function):
         features: torch.Tensor,
         backgrounds: torch.Tensor | None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        image, coverage, ctx.learnt = composite_forward(_layer(raster, features, backgrounds, min_transmittance))
+        image, coverage, ctx.saved = composite_forward(_layer(raster, features, backgrounds, min_transmittance))
         ctx.raster, ctx.min_transmittance = raster, min_transmittance
         ctx.shapes = {"points_uv": points_uv.shape, "radii": radii.shape, "opacities": opacities.shape}
         origin = features.new_empty(0)
@@ -261,8 +261,8 @@ class _Composite(torch.autograd.Function):
         image = zero if grad_image is None else grad_image.detach().resolve_neg().numpy()
         cover = None if grad_coverage is None else as_array(grad_coverage)
         names = ("points_uv", "radii", "opacities", "features", "backgrounds")
-        wanted = Wanted(**dict(zip(names, ctx.needs_input_grad[2:], strict=True)))
-        arrays = composite_backward(layer, ctx.learnt, image, cover, wanted)
+        needs_grad = NeedsGrad(**dict(zip(names, ctx.needs_input_grad[2:], strict=True)))
+        arrays = composite_backward(layer, ctx.saved, image, cover, needs_grad)
         shapes = {**ctx.shapes, "features": features.shape}
         shaped = (
             arrays[name].reshape(shapes.get(name, (-1, layer.channels))) if name in arrays else None for name in names

@@ -1,4 +1,4 @@
-"""What of a picture is still one surface in another view, and how far it is stretched there (kernels/stretch.cl)."""
+"""What of an image is still one surface in another view, and how far it is stretched there (kernels/stretch.cl)."""
 
 import numpy as np
 import torch
@@ -10,11 +10,11 @@ from vestcl.ops._autograd import untraced
 
 @untraced
 def stretch(points_uv: Array, magnified: Array) -> tuple[Array, Array]:
-    """How much farther apart than magnified a picture's points come to lie, and which are torn from all neighbours.
+    """How much farther apart than magnified an image's points come to lie, and which are torn from all neighbours.
 
         h = min(|uv - uv_left|, |uv - uv_right|),   v = min(|uv - uv_above|, |uv - uv_below|)
         each counts where it is below TORN max(m, 1), or where both of its gaps are below SLANTED m^2
-        factor = max(1, max(h, v) / m),   opacity = 1 where h or v counts or the picture is one pixel, else 0
+        factor = max(1, max(h, v) / m),   opacity = 1 where h or v counts or the image is one pixel, else 0
 
     Rows of a plane shear: where the steps to both sides differ by less than BENT of their means r, from left to right,
     and d, downwards, v is |r x d| / |r| as far as |r| counts and v is below the larger limit; h likewise.
@@ -23,7 +23,7 @@ def stretch(points_uv: Array, magnified: Array) -> tuple[Array, Array]:
     either side the nearer one counts, of both directions the wider gap.
 
     Args:
-        points_uv: [B, H, W, 2] px, where the view shows the picture's pixels; a gap to what is not finite does not
+        points_uv: [B, H, W, 2] px, where the view shows the image's pixels; a gap to what is not finite does not
             count. Torch CPU tensor or NumPy array, float32 or float64.
         magnified: m [B, H, W] px, the size that a pixel has in the view. Of the same kind and dtype.
 

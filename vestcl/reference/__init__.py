@@ -1,4 +1,7 @@
-"""The pure-torch twin of each operator: same file, same name, same signature. Slow, differentiable, on any device."""
+"""The pure-torch reference implementation of each operator: same file, same name, same signature.
+
+Slow, differentiable, on any device.
+"""
 
 from vestcl.reference.displace import displace
 from vestcl.reference.rigid_flow import rigid_flow

@@ -1,4 +1,4 @@
-"""What of a picture is still one surface in another view, and how far it is stretched there, in plain torch."""
+"""What of an image is still one surface in another view, and how far it is stretched there, in plain torch."""
 
 import torch
 from torch.nn import functional
@@ -7,17 +7,17 @@ from vestcl import constants
 
 
 def stretch(points_uv: torch.Tensor, magnified: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """How much farther apart than magnified a picture's points come to lie, and which are torn from all neighbours.
+    """How much farther apart than magnified an image's points come to lie, and which are torn from all neighbours.
 
         h = min(|uv - uv_left|, |uv - uv_right|),   v = min(|uv - uv_above|, |uv - uv_below|)
         each counts where it is below TORN max(m, 1), or where both of its gaps are below SLANTED m^2
-        factor = max(1, max(h, v) / m),   opacity = 1 where h or v counts or the picture is one pixel, else 0
+        factor = max(1, max(h, v) / m),   opacity = 1 where h or v counts or the image is one pixel, else 0
 
     Rows of a plane shear: where the steps to both sides differ by less than BENT of their means r, from left to right,
     and d, downwards, v is |r x d| / |r| as far as |r| counts and v is below the larger limit; h likewise.
 
     Args:
-        points_uv: [B, H, W, 2] px, where the view shows the picture's pixels; a gap to what is not finite does not
+        points_uv: [B, H, W, 2] px, where the view shows the image's pixels; a gap to what is not finite does not
             count.
         magnified: m [B, H, W] px, the size that a pixel has in the view.
 

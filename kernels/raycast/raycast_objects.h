@@ -1,4 +1,4 @@
-// Surfaces of what stands and moves on the street: cars, trees, people, poles.
+// Surfaces of the static and dynamic objects on the street: cars, trees, people, poles.
 
 #define CAR_PAINT 0.09f  // its mirror share
 

@@ -1,11 +1,12 @@
-// What compositing by tiles reads ahead, and how its backward walks a list forward again. After tile.h, prefetch.h.
+// What compositing by tiles reads ahead, and how its backward traverses a list forward again. After tile.h, prefetch.h.
 //
 // Points read ahead of their turn.
 #define AHEAD 16
 
-// How many entries of a tile's list the backward has to walk, and whether all their features are known to be finite.
-inline int pack_walked(int entries, bool finite) { return finite ? entries : ~entries; }
-inline int entries_walked(int packed) { return packed < 0 ? ~packed : packed; }
+// How many entries of a tile's list the backward has to traverse, and whether all their features are known to be
+// finite.
+inline int pack_traversed(int entries, bool finite) { return finite ? entries : ~entries; }
+inline int entries_traversed(int packed) { return packed < 0 ? ~packed : packed; }
 inline bool all_finite(int packed) { return packed >= 0; }
 
 inline void read_ahead(global const record_t* records, int e, global const REAL* features) {
@@ -37,7 +38,7 @@ inline void write_ahead(
 #endif
 }
 
-// The gradient at a tile's pixels, fetched item by item while the list is walked forward, which does not need it yet.
+// The gradient at a tile's pixels, fetched item by item during the forward traversal, which does not need it yet.
 // An item is a pixel where its channels are next to each other, else a row of pixels of PLANES channels.
 #define PLANES ((CHANNELS + TILE - 1) / TILE)
 #define PLANE_GROUPS ((CHANNELS + PLANES - 1) / PLANES)
@@ -72,18 +73,18 @@ inline void fetch_gradient(gradient_ahead_t* ahead) {
 typedef struct { REAL4 alpha, before; } quad_t;  // a_i and T_i, 0 and 0 where there is no fragment
 typedef struct {
   quad_t quads[SEGMENT / 4];
-  REAL transmittance[ROOM];
-} walk_t;
+  REAL transmittance[PADDED];
+} traversal_t;
 
-// Walk forward from entry e until the segment is full or the list ends; returns the entry after the last.
-inline int walk_forward(
-    walk_t* walk, int e, int end, bool known_finite, tile_t tile, REAL min_transmittance,
+// Traverse forward from entry e until the segment is full or the list ends; returns the entry after the last.
+inline int traverse_forward(
+    traversal_t* traversal, int e, int end, bool known_finite, tile_t tile, REAL min_transmittance,
     global const record_t* records, global const REAL* features, gradient_ahead_t* ahead) {
-  for (int slot = 0; e < end; e++) {
+  for (int offset = 0; e < end; e++) {
     fetch_gradient(ahead);
     global const record_t* point = records + e;
     const box_t box = unpack_box(point->box);
-    if (slot + quads_in(box) > SEGMENT / 4) break;
+    if (offset + quads_in(box) > SEGMENT / 4) break;
     bool finite = true;
     if (!known_finite) {
       vector_t f[BLOCKS];
@@ -92,13 +93,13 @@ inline int walk_forward(
     disc_t disc = disc_of(point, tile);
     if (!finite) disc.r2 = 0;
     for (int y = box.y0; y < box.y1; y += 2)
-      for (int x = box.x0; x < box.x1; x += 2, slot++) {
+      for (int x = box.x0; x < box.x1; x += 2, offset++) {
         const int p = y * STRIDE + x;
-        const REAL4 t = load_quad(walk->transmittance, p);
+        const REAL4 t = load_quad(traversal->transmittance, p);
         quad_t quad;
         quad.alpha = quad_alphas(disc, x, y, t, min_transmittance, &quad.before);
-        walk->quads[slot] = quad;
-        store_quad(t * (1 - quad.alpha), walk->transmittance, p);
+        traversal->quads[offset] = quad;
+        store_quad(t * (1 - quad.alpha), traversal->transmittance, p);
       }
   }
   return e;
