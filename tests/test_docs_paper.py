@@ -58,7 +58,7 @@ def faults(text: str, page: Path) -> list[str]:
         elif file != path.name:
             found.append(f"{label}: the link is to {path.name}")
         elif name.startswith(":") and not name.startswith(":test_"):
-            found.append(f"{label}: is no test")
+            found.append(f"{label}: is not a test")
         elif colon and name.removeprefix(":") not in defined_in(path):
             found.append(f"{label}: no such name")
     return found
@@ -106,7 +106,7 @@ def test_it_has_all_parts_and_is_linked() -> None:
         ("unproject.cl:unproject_backward", "../kernels/unproject.cl", None),
         ("unproject.cl:row_start", "../kernels/unproject.cl", "unproject.cl:row_start: no such name"),
         ("test_docs_paper.py::test_a", "../tests/test_docs_paper.py", "test_docs_paper.py::test_a: no such name"),
-        ("test_docs_paper.py::links", "../tests/test_docs_paper.py", "test_docs_paper.py::links: is no test"),
+        ("test_docs_paper.py::links", "../tests/test_docs_paper.py", "test_docs_paper.py::links: is not a test"),
     ],
 )
 def test_a_wrong_link_is_found(label: str, target: str, fault: str | None) -> None:

@@ -103,7 +103,7 @@ def test_a_device_that_hangs(only_pip: Path) -> None:
     assert f"move the .icd files in {only_pip} away one by one" in notes(report)
 
 
-def test_children_tell_how_they_ended() -> None:
+def test_children_report_how_they_ended() -> None:
     def ending(code: str) -> str:
         return doctor._run_child([sys.executable, "-c", code], timeout=60).ending
 

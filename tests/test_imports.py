@@ -25,7 +25,7 @@ ORDER = (
     ("evaluation",),
     ("doctor", "bench", "viewer", "cli", "__main__"),
 )
-LEVELS = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
+LEVELS = {folder: level for level, group in enumerate(ORDER) for folder in group}
 
 
 def module_of(file: Path) -> str:
@@ -79,20 +79,20 @@ def test_no_module_imports_itself_by_others() -> None:
     assert cycle({"a": frozenset("b"), "b": frozenset("a")}), "a circle would be found"
 
 
-def room(module: str) -> str:
+def folder(module: str) -> str:
     return module.split(".")[1] if module.startswith("vestcl.") else ""
 
 
 @pytest.mark.parametrize("file", LIBRARY, ids=identify)
-def test_rooms_import_downwards(file: Path) -> None:
-    own = room(module_of(file))
+def test_packages_import_downwards(file: Path) -> None:
+    own = folder(module_of(file))
     if own:  # the package itself has lazy names only
-        taken = {room(module) for module in graph()[module_of(file)]} - {""}
+        taken = {folder(module) for module in graph()[module_of(file)]} - {""}
         assert not {name for name in taken if LEVELS[name] > LEVELS[own]}
 
 
-def test_every_room_has_its_place() -> None:
-    assert {room(module) for module in MODULES if room(module)} <= {*LEVELS, "weights"}
+def test_every_package_has_a_level() -> None:
+    assert {folder(module) for module in MODULES if folder(module)} <= {*LEVELS, "weights"}
 
 
 def hidden_from(module: str, name: str) -> bool:
@@ -136,13 +136,13 @@ def test_the_library_does_not_import_training(file: Path) -> None:
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "vestcl" / "reference").rglob("*.py")), ids=identify)
-def test_the_twins_stand_alone(file: Path) -> None:
+def test_the_reference_imports_geometry_only(file: Path) -> None:
     allowed = ("torch", "vestcl.geometry", "vestcl.constants", "vestcl.reference", *sys.stdlib_module_names)
     assert not [module for module in imports(file) if not is_in(module, *allowed)]
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "vestcl" / "ops").rglob("*.py")), ids=identify)
-def test_operators_stand_on_the_runtime(file: Path) -> None:
+def test_operators_depend_on_the_runtime(file: Path) -> None:
     below = ("vestcl.constants", "vestcl.geometry", "vestcl.ops", "vestcl.opencl")
     ours = {module for module in imports(file) if is_in(module, "vestcl")}
     assert not {module for module in ours if not is_in(module, *below)}

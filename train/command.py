@@ -48,11 +48,11 @@ def warnings_in_lines() -> Iterator[None]:
         if issubclass(category, UserWarning):
             print(f"warning: {message}", file=file or sys.stderr)
         else:
-            usual(message, category, filename, lineno, file, line)
+            default(message, category, filename, lineno, file, line)
 
-    usual: Any = warnings.showwarning
+    default: Any = warnings.showwarning
     warnings.showwarning = show
     try:
         yield
     finally:
-        warnings.showwarning = usual
+        warnings.showwarning = default

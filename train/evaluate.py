@@ -6,8 +6,8 @@ every table names where these come from.
 `train.evaluation.protocols` says what is evaluated, `train.evaluation.windows` how one window is,
 `train.evaluation.report` what comes out.
 
-A killed evaluation goes on where it was: what is done lies in OUT/clips, by settings, models and vestcl's version (not
-its code: delete the folder when that has changed). Several processes share the work with
+A killed evaluation continues where it was: what is done lies in OUT/clips, by settings, models and vestcl's version
+(not its code: delete the folder when that has changed). Several processes share the work with
 --shard 0/4 ... 3/4, or under torchrun; the one that finds all parts done makes the tables, and so does --merge.
 """
 
@@ -59,7 +59,7 @@ _PUBLISHED: Final = ("size", "steps", "first", "last")
 
 @interrupt.command
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; what a user can put right is told in one line, with exit code 2."""
+    """The command; what a user can put right is reported in one line, with exit code 2."""
     config = command_line.parsed(Evaluation, "python -m train.evaluate", __doc__, arguments)
     try:
         evaluate(config)
@@ -75,7 +75,7 @@ def evaluate(config: Evaluation) -> None:
         config: what to evaluate.
 
     Raises:
-        ValueError: a setting out of range, clips that are missing or too short, a file that is no model.
+        ValueError: a setting out of range, clips that are missing or too short, a file that is not a model.
         FileNotFoundError: no such model or weights.
         DeviceError: no such device.
     """
@@ -176,24 +176,26 @@ def _where(config: Evaluation, protocol: Protocol) -> Where:
 
 def _caveats(config: Evaluation, setup: Setup) -> list[str]:
     """What was not measured, and what differs from what is published."""
-    protocol, told = setup.protocol, list[str]()
+    protocol, remarks = setup.protocol, list[str]()
     names = {"lpips": "LPIPS (--lpips)", "st_lpips": "ST-LPIPS (--st-lpips)", "squeeze": "squeeze distance (--squeeze)"}
     if absent := [name for option, name in names.items() if getattr(config, option) is None]:
-        told.append(f"Without weights, not measured: {', '.join(absent)}.")
+        remarks.append(f"Without weights, not measured: {', '.join(absent)}.")
     if min(setup.size) < MS_SSIM_SIDE:
-        told.append(f"MS-SSIM needs {MS_SSIM_SIDE} pixels a side, got {setup.size[0]} x {setup.size[1]}.")
+        remarks.append(f"MS-SSIM needs {MS_SSIM_SIDE} pixels per side, got {setup.size[0]} x {setup.size[1]}.")
     if config.peer is not None:
-        told.append(f"{peer.METHOD} ({config.peer.name}): {peer.ABOUT}")
+        remarks.append(f"{peer.METHOD} ({config.peer.name}): {peer.ABOUT}")
     default = PROTOCOLS[config.protocol]
     changed = [f"{name} {getattr(protocol, name)}" for name in _PUBLISHED
                if getattr(protocol, name) != getattr(default, name)]  # fmt: skip
     changed += [f"every {config.every}"] if config.every > 1 else []
     composed = [name for name, mode in setup.modes.items() if mode == "compose"]
     if default.paper and composed and protocol.steps > 1:
-        told.append(f"Mode compose, where the paper's models forecast recursively (feedback): {', '.join(composed)}.")
+        remarks.append(
+            f"Mode compose, where the paper's models forecast recursively (feedback): {', '.join(composed)}."
+        )
     if default.paper and changed:
-        told.append(f"Not the published protocol: {', '.join(changed)}.")
-    return told + [NOW_NOTE] * protocol.now
+        remarks.append(f"Not the published protocol: {', '.join(changed)}.")
+    return remarks + [NOW_NOTE] * protocol.now
 
 
 # ---------------------------------------------------------------- work and results
@@ -235,7 +237,7 @@ def _write(out: Path, results: report.EvaluationResults, about: dict[str, Any], 
     settings = ", ".join(f"{name} {value}" for name, value in about["settings"].items() if value is not None)
     for grid in report.short_grids(results):
         console.print(to_rich(grid))
-    for line in results.told:
+    for line in results.remarks:
         console.print(line, highlight=False, soft_wrap=True)
     content = {
         "results.json": json.dumps(report.as_json(results, about), indent=1) + "\n",

@@ -1,7 +1,7 @@
 """Train a model: ``python -m train.fit train/configs/vest-s_street.yaml data.train='[cache/*]' out=runs/first``.
 
 From frames to the loss everything is differentiable, the OpenCL splatting included. A run can be killed at any moment:
-``--resume`` goes on from its last checkpoint to the same weights. Under torchrun processes share each batch.
+``--resume`` continues from its last checkpoint to the same weights. Under torchrun processes share each batch.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ from vestcl.models.forecaster import Forecaster
 from vestcl.models.weights_file import misfit
 from vestcl.prepare.prepared import find_prepared
 
-#: The exit status of a run that was told to stop (SIGTERM), as a shell has it.
+#: The exit status of a run that was asked to stop (SIGTERM), as a shell has it.
 STOPPED: Final = 128 + signal.SIGTERM
 
 
@@ -99,7 +99,7 @@ def fit(config: Config, *, go_on: bool = False, ranks: Ranks | None = None, devi
 
     Raises:
         ValueError: data or weights that can't be used, a run that exists already, or another one's checkpoint.
-        TrainingError: a loss or gradient that is no number.
+        TrainingError: a non-finite loss or gradient.
         CheckpointError: the last checkpoint can't be written, or none can be read.
         ChildProcessError: a process that reads data was killed.
         KeyboardInterrupt: after SIGINT, with a checkpoint of where it was.
@@ -120,7 +120,7 @@ def fit(config: Config, *, go_on: bool = False, ranks: Ranks | None = None, devi
 def _last_state(config: Config, go_on: bool) -> TrainingState | None:
     if not go_on:
         if checkpoint.list_checkpoints(config.out):
-            raise ValueError(f"`out` {config.out} has a run already: --resume goes on with it, or take another folder")
+            raise ValueError(f"`out` {config.out} has a run already: --resume continues it, or take another folder")
         return None
     state = checkpoint.load_latest(config.out)
     if state is not None:
@@ -193,7 +193,7 @@ class _Run:
                 state = None
                 if not self._train(trainer, position.number, position.step):
                     if self.stop.asked != signal.SIGINT:  # whose line `interrupt.command` prints
-                        self.report.say(f"stopped after step {self.step}; --resume goes on")
+                        self.report.say(f"stopped after step {self.step}; --resume continues")
                     return False
         self.report.say(f"finished: {self.config.out}")
         return True
@@ -240,7 +240,7 @@ class _Run:
         return True
 
     def _save(self, trainer: Trainer, must: bool) -> None:
-        """Write a checkpoint; without ``must`` a full disk is told of, and training goes on."""
+        """Write a checkpoint; without ``must`` a full disk is reported, and training continues."""
         if not self.ranks.first:
             return
         adam, schedule = trainer.state()

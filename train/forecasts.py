@@ -61,7 +61,7 @@ class Forecasts:
     frames: int = 10
     """Frames of each street."""
     samples: int = 1
-    """Streets' colour is the mean over samples x samples rays a pixel."""
+    """Streets' colour is the mean over samples x samples rays per pixel."""
     windows: int = 2
     """Windows of a clip at most, evenly spaced."""
     horizons: tuple[int, ...] = (1, 3, 5)
@@ -199,7 +199,7 @@ def make(options: Forecasts, console: Console) -> Made:
     """Fill the cache with the windows of one shard.
 
     Raises:
-        ValueError: an input that is no clip, or an option out of range.
+        ValueError: an input that is not a clip, or an option out of range.
         OSError: a window can't be written.
     """
     check_options(options)

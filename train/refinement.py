@@ -45,7 +45,7 @@ class ForecastData:
     """What is shown, and how it is varied."""
 
     train: tuple[str, ...]
-    """Folders of a cache of `train.forecasts`, one a clip; the last part may be a pattern ("cache/street_3*")."""
+    """Folders of a cache of `train.forecasts`, one per clip; the last part may be a pattern ("cache/street_3*")."""
     crop: tuple[Count, Count] | None = None
     """(height, width) px of a part drawn at random; null shows whole images."""
     flip: bool = True
@@ -122,7 +122,7 @@ class Samples:
         return planes, targets
 
     def _sample(self, number: int) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-        """Every file once an epoch, in an order of its own; one of its entries, varied."""
+        """Every file once per epoch, in an order of its own; one of its entries, varied."""
         epoch, place = divmod(number, len(self.files))
         file = self.files[np.random.default_rng([self.seed, epoch]).permutation(len(self.files))[place]]
         rng = np.random.default_rng([self.seed, 1, number])

@@ -14,7 +14,7 @@ BEHIND: Final = 1.01
 TILE: Final = 16
 
 #: Pixels that were next to each other belong to one surface if a view shows them no farther apart than that, times
-#: what it magnifies: less tears surfaces that turn towards the camera, more draws skins between things and background.
+#: what it magnifies: less tears surfaces that turn towards the camera, more draws skins between objects and background.
 TORN: Final = 2.5
 
 #: A plane along which the camera moves is stretched by the square of what it magnifies: close to the camera by more
@@ -41,9 +41,9 @@ CACHE_LINE: Final = 64
 
 #: Outputs of this many bytes and more are recycled (below, the C library recycles them itself) ...
 HOST_POOL_FROM: Final = 1 << 18
-#: ... and so many bytes of them are kept (the outputs of a training step at 256 x 832), or what was in use at once.
+#: ... and this many bytes of them are kept (the outputs of a training step at 256 x 832), or what was in use at once.
 HOST_POOL_BYTES: Final = 1 << 29
 
 #: Depth of the sky, metres: so far that driving 5 m on shifts it by less than half a pixel of a 1242 pixels wide
-#: picture, so that in effect it only turns (SPEC section 3.5).
+#: image, so that in effect it only turns (SPEC section 3.5).
 SKY_DEPTH: Final = 10_000.0

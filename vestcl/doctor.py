@@ -43,7 +43,7 @@ class DeviceReport:
 
     @property
     def works(self) -> bool:
-        """Whether vestcl can use the device. Lacking float64 is no fault: float32 remains."""
+        """Whether vestcl can use the device. Lacking float64 is not a fault: float32 remains."""
         return len(self.steps) == len(STEPS) and all(s.passed or s.name == "float64" for s in self.steps)
 
 
@@ -62,7 +62,7 @@ class Report:
 
 
 def examine(timeout: float = 120.0) -> Report:
-    """Try every OpenCL device in a child process of its own.
+    """Try every OpenCL device in a separate child process.
 
     Args:
         timeout: seconds that each child may take.
@@ -81,7 +81,7 @@ def examine(timeout: float = 120.0) -> Report:
     notes += [line["error"] for line in listing.lines if infos and "error" in line]
     notes += icd.intel_notes([info.platform for info in infos])
     if os.environ.get("RUSTICL_ENABLE") is None and any("rusticl" in library.lower() for _, library in icd.drivers()):
-        notes.append("rusticl shows no device until it is told which: RUSTICL_ENABLE=llvmpipe, radeonsi, iris, ...")
+        notes.append("rusticl shows no device until one is chosen: RUSTICL_ENABLE=llvmpipe, radeonsi, iris, ...")
     default = next((line["default"] for line in listing.lines if "default" in line), None)
     return Report(tuple(_examine_device(info, timeout) for info in infos), default, tuple(notes))
 
@@ -134,13 +134,13 @@ def _examine_device(info: opencl.DeviceInfo, timeout: float) -> DeviceReport:
 
 
 def _driver_notes(timeout: float) -> Iterator[str]:
-    """The drivers that can't be loaded, each tried in a process of its own."""
+    """The drivers that can't be loaded, each tried in a separate process."""
     for file, library in icd.drivers():
         child = _run_child([sys.executable, "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", library], timeout)
         if child.ending:
             yield f"{file} names {library}, which can't be loaded: {child.ending}"
             if "intelocl" in library:
-                yield f"{file} must hold the full path of libintelocl.so; `pip show -f intel-opencl-rt` tells it"
+                yield f"{file} must hold the full path of libintelocl.so; `pip show -f intel-opencl-rt` shows it"
 
 
 # ---------------------------------------------------------------- the children

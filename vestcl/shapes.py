@@ -4,7 +4,7 @@ import torch
 
 
 def check(**arguments: tuple[torch.Tensor, str]) -> dict[str, int]:
-    """Hold a network's arguments against their shapes; the sizes that the letters stand for.
+    """Check a network's arguments against their shapes; the sizes that the letters denote.
 
     Args:
         **arguments: name = (tensor, shape), with the shape as words: a number is that size, a letter must mean the

@@ -6,11 +6,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Intervals count as equal up to this share, and so many seconds: clocks jitter, and containers round times to 1 ms.
+#: Intervals count as equal up to this share, and this many seconds: clocks jitter, and containers round times to 1 ms.
 _JITTER: Final = 0.02
 _ROUNDED: Final = 0.0011
 
-#: A frame stands for a time from which it is at most so many intervals away.
+#: A frame represents a time from which it is at most this many intervals away.
 NEAR: Final = 0.25
 
 #: A network's interval and a clip's are the same up to this share.
@@ -40,7 +40,7 @@ def check_increasing(seconds: Sequence[float], names: Sequence[str], where: str)
 
 
 def median_interval(seconds: Sequence[float] | NDArray[np.float64]) -> float | None:
-    """The median of the intervals between increasing times; of those that rounding alone tells from it, the mean.
+    """The median of the intervals between increasing times; of those that only rounding separates from it, the mean.
 
     Args:
         seconds: of consecutive frames.
@@ -52,8 +52,8 @@ def median_interval(seconds: Sequence[float] | NDArray[np.float64]) -> float | N
     if not len(gaps):
         return None
     median = float(np.median(gaps))
-    alike = gaps[_is_alike(gaps, median)]
-    return float(alike.mean()) if len(alike) else median
+    close = gaps[_is_close(gaps, median)]
+    return float(close.mean()) if len(close) else median
 
 
 def positions(seconds: Sequence[float] | NDArray[np.float64], interval: float) -> NDArray[np.float64]:
@@ -67,7 +67,7 @@ def positions(seconds: Sequence[float] | NDArray[np.float64], interval: float) -
         As many as times.
     """
     gaps = np.diff(np.asarray(seconds, np.float64))
-    counted = np.where(_is_alike(gaps, interval), 1.0, gaps / interval)
+    counted = np.where(_is_close(gaps, interval), 1.0, gaps / interval)
     return np.concatenate([[0.0], np.cumsum(counted).round(6)])
 
 
@@ -97,5 +97,5 @@ def is_same(interval: float, other: float) -> bool:
     return abs(interval / other - 1) <= _SAME
 
 
-def _is_alike(gaps: NDArray[np.float64], interval: float) -> NDArray[np.bool_]:
+def _is_close(gaps: NDArray[np.float64], interval: float) -> NDArray[np.bool_]:
     return np.asarray(np.abs(gaps - interval) <= _JITTER * interval + min(_ROUNDED, interval / 8))

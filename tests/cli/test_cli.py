@@ -70,8 +70,8 @@ def test_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     options = "--out x --height 8 --width 9 --seed 3 --quality fast --device"
     assert cli.main(["demo", *options.split(), last]) == 0
     assert cli.main(["demo", "--model", "geometric"]) == 0
-    usual, given, geometric = calls
-    assert usual == (Path("out"), 256, 832, 3, None, "balanced", before.info.index)
+    default, given, geometric = calls
+    assert default == (Path("out"), 256, 832, 3, None, "balanced", before.info.index)
     assert given == (Path("x"), 8, 9, 3, None, "fast", last)
     assert geometric[4] == "geometric"
     assert opencl.current() is before
@@ -125,9 +125,7 @@ def test_a_bench_does_not_need_the_others(monkeypatch: pytest.MonkeyPatch) -> No
     assert configs == [NetworkBench(9)]
 
 
-def test_a_broken_bench_stands_in_nobodys_way(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_broken_bench_blocks_no_other(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Of the list of all benches it is left out, and it says what is wrong when it is asked for."""
 
     @dataclass(frozen=True)
@@ -148,8 +146,8 @@ def test_a_broken_bench_stands_in_nobodys_way(
         cli.main(["bench", "--help"])
     out, err = capsys.readouterr()
     assert "Time splat" in out
-    told = err.splitlines()
-    assert len(told) == 2 and "operators is left out" in told[0] and "abacus" in told[0] and "pareto" in told[1]
+    lines = err.splitlines()
+    assert len(lines) == 2 and "operators is left out" in lines[0] and "abacus" in lines[0] and "pareto" in lines[1]
     with pytest.raises(AttributeError, match="ParetoBench"):
         cli.main(["bench", "pareto"])
 
@@ -201,7 +199,7 @@ def test_label_ids_are_those_of_the_readers() -> None:
     assert get_args(get_type_hints(cli.Forecast)["label_ids"]) == get_args(LabelKind)
 
 
-def test_doctor_tells_what_works(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_reports_what_works(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     info = opencl.select()
     sound = doctor.DeviceReport(info, tuple(doctor.DeviceCheck(name, True) for name in doctor.STEPS), ())
     ill = doctor.DeviceReport(info, (doctor.DeviceCheck("build", False, "no [ld]"),), ("build: no [ld]",))

@@ -34,7 +34,7 @@ def test_does_the_whole_job(model: str, tmp_path: Path, capsys: pytest.CaptureFi
         assert (set(of) - {"forecast", "repeat last", "optical flow"}) == ({"geometric"} - {model})
 
 
-def test_the_shipped_network_is_the_usual_one(
+def test_the_shipped_network_is_the_default_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(shipped, "FOLDER", tmp_path)
@@ -56,7 +56,7 @@ def test_the_shipped_network_is_the_usual_one(
 
 
 def test_an_unknown_model(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="vest-xl: is no model"):
+    with pytest.raises(ValueError, match="vest-xl: is not a model"):
         demo.run(tmp_path / "out", height=48, width=160, seed=4, model="vest-xl")
     assert not (tmp_path / "out").exists()
 

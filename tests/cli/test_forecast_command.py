@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from data_files import write_pictures, write_text
+from data_files import write_images, write_text
 from forecast_clips import FRAMES, HEIGHT, WIDTH, Repeater, write_clip
 from onnx_files import write_mix
 from st_lpips_weights import public_state
@@ -40,8 +40,8 @@ def test_everything_at_once(
     folder: Path, tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, last, before = tmp_path / "out", opencl.devices()[-1].index, opencl.current()
-    told = f"forecast {folder} --out {out} --steps 2 --view right --view source --view -0.5,0,0,yaw=5,name=side"
-    assert cli.main([*told.split(), "--compare", "--gif", "--device", last]) == 0
+    arguments = f"forecast {folder} --out {out} --steps 2 --view right --view source --view -0.5,0,0,yaw=5,name=side"
+    assert cli.main([*arguments.split(), "--compare", "--gif", "--device", last]) == 0
     ((clip, index, steps, views),) = repeater.calls
     assert (len(clip), index, steps, [view.name for view in views]) == (6, 3, 2, ["right", "source", "side"])
     assert repeater.devices == [last]
@@ -80,31 +80,31 @@ def test_by_default_the_source_after_the_last_frame(folder: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("told", "size"),
+    ("arguments", "size"),
     [("--height 48", (48, 80)), ("--width 20", (12, 20)), ("--height 30 --width 20", (30, 20)), ("", (24, 40))],
 )
-def test_size(told: str, size: tuple[int, int], folder: Path, tmp_path: Path, repeater: Repeater) -> None:
-    assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), *told.split()]) == 0
+def test_size(arguments: str, size: tuple[int, int], folder: Path, tmp_path: Path, repeater: Repeater) -> None:
+    assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), *arguments.split()]) == 0
     clip = repeater.calls[0][0]
     assert (clip[0].height, clip[0].width) == size
     assert clip[0].K[0, 0] == pytest.approx(40 * size[1] / WIDTH)
     assert read_forecast(tmp_path / "out").about["views"]["source"]["width"] == size[1]
 
 
-@pytest.mark.parametrize(("told", "index"), [("--frame 1", 1), ("--frame 4 --compare", 4), ("--frame 5", 5)])
-def test_frame(told: str, index: int, folder: Path, tmp_path: Path, repeater: Repeater) -> None:
-    assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), *told.split()]) == 0
+@pytest.mark.parametrize(("arguments", "index"), [("--frame 1", 1), ("--frame 4 --compare", 4), ("--frame 5", 5)])
+def test_frame(arguments: str, index: int, folder: Path, tmp_path: Path, repeater: Repeater) -> None:
+    assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), *arguments.split()]) == 0
     assert repeater.calls[0][1] == index
 
 
-def test_files_beside_the_clip_and_options_of_its_layout(tmp_path: Path, repeater: Repeater) -> None:
+def test_files_next_to_the_clip_and_options_of_its_layout(tmp_path: Path, repeater: Repeater) -> None:
     bare = tmp_path / "bare"
-    write_pictures(bare, ["a.png", "b.png"], HEIGHT, WIDTH)
+    write_images(bare, ["a.png", "b.png"], HEIGHT, WIDTH)
     for name in ("a", "b"):
         (tmp_path / "metres").mkdir(exist_ok=True)
         np.save(tmp_path / "metres" / f"{name}.npy", np.full((HEIGHT, WIDTH), 7, np.float32))
-    told = f"forecast {bare} --out {tmp_path / 'out'} --fov 90 --depth {tmp_path / 'metres'}"
-    assert cli.main(told.split()) == 0
+    arguments = f"forecast {bare} --out {tmp_path / 'out'} --fov 90 --depth {tmp_path / 'metres'}"
+    assert cli.main(arguments.split()) == 0
     clip = repeater.calls[0][0]
     assert clip[0].K[0, 0] == pytest.approx(WIDTH / 2)
     assert (clip[1].read_depth() == 7).all()
@@ -126,10 +126,10 @@ def test_estimators_take_the_place_of_files(
 
     members = {"DepthEstimator": estimator("depth"), "SegmentationEstimator": estimator("classes")}
     put_module(monkeypatch, "vestcl.scene.estimators", with_estimates=with_estimates, **members)
-    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1"]
-    assert cli.main([*told, "--depth-model", "zoe", "--mask-model", "former"]) == 0
-    assert cli.main([*told, "--depth-model", "zoe"]) == 0
-    assert cli.main(told) == 0
+    arguments = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1"]
+    assert cli.main([*arguments, "--depth-model", "zoe", "--mask-model", "former"]) == 0
+    assert cli.main([*arguments, "--depth-model", "zoe"]) == 0
+    assert cli.main(arguments) == 0
     assert calls == [("depth of zoe", "classes of former"), ("depth of zoe", None)]
 
 
@@ -138,8 +138,8 @@ def test_onnx_files_are_estimators(folder: Path, tmp_path: Path, repeater: Repea
     depth = write_mix(tmp_path / "depth.onnx", [[1.0, 0.0, 0.0]], metres=10)
     scores = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     classes = write_mix(tmp_path / "classes.onnx", scores, (HEIGHT, WIDTH), classes=[0, 13], std=1)
-    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1"]
-    assert cli.main([*told, "--depth-model", str(depth), "--mask-model", str(classes)]) == 0
+    arguments = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1"]
+    assert cli.main([*arguments, "--depth-model", str(depth), "--mask-model", str(classes)]) == 0
     sample = repeater.calls[0][0][1]
     image = sample.read_image()
     assert sample.read_depth().shape == (1, HEIGHT, WIDTH) and sample.read_depth().max() <= 10
@@ -150,10 +150,10 @@ def test_onnx_files_are_estimators(folder: Path, tmp_path: Path, repeater: Repea
 def test_networks_that_cannot_be_had_are_one_line(
     option: str, folder: Path, tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), option]
+    arguments = ["forecast", str(folder), "--out", str(tmp_path / "out"), option]
     (tmp_path / "text.onnx").write_text("no network")
-    for value, message in (("missing.onnx", "there is no file"), ("text.onnx", "is no ONNX file")):
-        assert cli.main([*told, str(tmp_path / value)]) == 2
+    for value, message in (("missing.onnx", "there is no file"), ("text.onnx", "is not an ONNX file")):
+        assert cli.main([*arguments, str(tmp_path / value)]) == 2
         error = capsys.readouterr().err
         assert error.startswith("error: ") and error.count("\n") == 1 and message in error and value in error
 
@@ -176,7 +176,7 @@ def test_a_missing_extra_is_one_line(
 
 
 @pytest.mark.parametrize(
-    ("told", "frames", "size", "index"),
+    ("arguments", "frames", "size", "index"),
     [
         ("", 4, (256, 832), 3),
         ("--compare --steps 2", 6, (256, 832), 3),
@@ -185,7 +185,7 @@ def test_a_missing_extra_is_one_line(
     ],
 )
 def test_street(
-    told: str,
+    arguments: str,
     frames: int,
     size: tuple[int, int],
     index: int,
@@ -202,7 +202,7 @@ def test_street(
         return Clip("street", "street", tuple(Sample.from_arrays(f"{i}", image, K) for i in range(frames)))
 
     monkeypatch.setattr("vestcl.data.street.input.street_clip", clip)
-    assert cli.main(["forecast", "street:7", "--out", str(tmp_path / "out"), *told.split()]) == 0
+    assert cli.main(["forecast", "street:7", "--out", str(tmp_path / "out"), *arguments.split()]) == 0
     assert wanted == [(7, frames, size)]
     assert repeater.calls[0][1] == index
 
@@ -215,9 +215,9 @@ def test_a_long_table_shows_some_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    write_pictures(folder / "image", [f"{i:04}.png" for i in range(14)], HEIGHT, WIDTH)
-    told = f"forecast {folder} --out {tmp_path / 'out'} --steps 12 --compare --no-exr"
-    assert cli.main(told.split()) == 0
+    write_images(folder / "image", [f"{i:04}.png" for i in range(14)], HEIGHT, WIDTH)
+    arguments = f"forecast {folder} --out {tmp_path / 'out'} --steps 12 --compare --no-exr"
+    assert cli.main(arguments.split()) == 0
     said = capsys.readouterr().out
     heading = next(line for line in said.splitlines() if "t+1" in line)
     assert heading.split() == ["t+1", "t+4", "t+6", "t+9", "t+12", "mean"]
@@ -233,8 +233,8 @@ def test_weights_of_distances(
 ) -> None:
     torch.save(Trunk("squeezenet1_0").state_dict(), tmp_path / "squeeze.pth")
     torch.save(public_state(), tmp_path / "st.pth")
-    told = f"forecast {folder} --out {tmp_path / 'out'} --steps 1 --compare --squeeze {tmp_path / 'squeeze.pth'}"
-    assert cli.main([*told.split(), "--st-lpips", str(tmp_path / "st.pth")]) == 0
+    arguments = f"forecast {folder} --out {tmp_path / 'out'} --steps 1 --compare --squeeze {tmp_path / 'squeeze.pth'}"
+    assert cli.main([*arguments.split(), "--st-lpips", str(tmp_path / "st.pth")]) == 0
     saved = read_forecast(tmp_path / "out").about
     scores = saved["scores"]["source"]["forecast"][0]
     assert scores["squeeze"] > 0 and scores["st_lpips"] > 0 and "lpips" not in scores
@@ -243,7 +243,7 @@ def test_weights_of_distances(
 
 
 @pytest.mark.parametrize(
-    ("told", "message"),
+    ("arguments", "message"),
     [
         ("--steps 0", "--steps must be 1 or more, got 0"),
         ("--height 0", "--height must be 1 or more, got 0"),
@@ -257,22 +257,22 @@ def test_weights_of_distances(
         ("--perceive splatted", "--perceive is how a network sees its own forecast; it needs --model"),
         ("--memory -1", "--memory must be 0 frames or more, got -1"),
         ("--memory 2 --model vest-s", "--memory is of the geometric forecast: it can't be combined with --model"),
-        ("--mode feedback", "--mode is how a network goes on after its first step; it needs --model"),
-        ("--model vest-xl", "vest-xl: is no model: no file, no checkpoint's folder, and none of vest-s"),
+        ("--mode feedback", "--mode is how a network continues after its first step; it needs --model"),
+        ("--model vest-xl", "vest-xl: is not a model: no file, no checkpoint's folder, and none of vest-s"),
         ("--squeeze x.pth", "--squeeze is a distance to the truth; it needs --compare"),
         ("--squeeze x.pth --compare --steps 1", "no squeezenet1_0 weights at x.pth"),
         ("--st-lpips", "--st-lpips is a distance to the truth; it needs --compare"),
         ("--st-lpips x.pth --compare --steps 1", "no ST-LPIPS weights at x.pth"),
-        ("--fov 90", "camera.json: tells the camera; leave out --fov"),
+        ("--fov 90", "camera.json: defines the camera; leave out --fov"),
         ("--rig grey", "is folder, which takes --fov, not --rig"),
         ("--depth nowhere", "--depth must be a folder of files with the frames' names, and nowhere does not exist"),
         ("--device abacus", "--device 'abacus' fits none"),
     ],
 )
 def test_mistakes_are_one_line(
-    told: str, message: str, folder: Path, tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
+    arguments: str, message: str, folder: Path, tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), *told.split()]) == 2
+    assert cli.main(["forecast", str(folder), "--out", str(tmp_path / "out"), *arguments.split()]) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ")
@@ -284,13 +284,13 @@ def test_mistakes_are_one_line(
 def test_mistakes_with_the_input_are_one_line(
     tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for told, message in (
+    for arguments, message in (
         ("nowhere", "nowhere: no such file or folder"),
         ("street:x", "street:x: must be street:SEED"),
         ("street:0 --fov 9 --depth d", "street:0: is a street, which takes --height, --width, not --fov, --depth"),
         ("street:0 --frame 0", "--frame must be 1"),
     ):
-        assert cli.main(["forecast", *told.split(), "--out", str(tmp_path / "out")]) == 2
+        assert cli.main(["forecast", *arguments.split(), "--out", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err
 
 
@@ -305,6 +305,6 @@ def test_an_out_that_is_a_file_is_one_line(
 
 
 def test_the_number_of_remembered_frames(folder: Path, tmp_path: Path, repeater: Repeater) -> None:
-    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1"]
-    assert cli.main([*told, "--memory", "5"]) == 0 and cli.main(told) == 0
+    arguments = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1"]
+    assert cli.main([*arguments, "--memory", "5"]) == 0 and cli.main(arguments) == 0
     assert repeater.networks == [(5,), ()]

@@ -19,8 +19,8 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(file: Path, out: Path, *options: str) -> str:
-    told = f"forecast street:3 --height 48 --width 160 --frame 4 --steps 2 --no-exr --out {out} --model {file}"
-    return " ".join([told, *options])
+    arguments = f"forecast street:3 --height 48 --width 160 --frame 4 --steps 2 --no-exr --out {out} --model {file}"
+    return " ".join([arguments, *options])
 
 
 def test_what_was_left_out_and_why(

@@ -1,4 +1,4 @@
-"""`vestcl forecast --model`: which forecaster runs, what it is held against, and what the files tell of it."""
+"""`vestcl forecast --model`: which forecaster runs, what it is compared with, and what the files contain about it."""
 
 import hashlib
 from pathlib import Path
@@ -50,8 +50,8 @@ def file(tmp_path: Path) -> Path:
 def test_the_network_takes_the_geometric_ones_place(
     folder: Path, tmp_path: Path, file: Path, network: Repeater, geometric: Repeater, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1", "--frame", "3", "--no-exr"]
-    assert cli.main([*told, "--model", str(file)]) == 0
+    arguments = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--steps", "1", "--frame", "3", "--no-exr"]
+    assert cli.main([*arguments, "--model", str(file)]) == 0
     assert f"forecast: tiny, {file}, mode feedback" in capsys.readouterr().out
     assert not geometric.calls
     ((model, mode),) = network.networks
@@ -74,8 +74,8 @@ def test_the_mode_of_later_frames(
     """The option's, or else what the model starts from decides; forecast.json names it."""
     file, wanted = tmp_path / "m.safetensors", mode or {"rest": "feedback", "prior": "compose"}[start]
     Forecaster(TINY if start == "rest" else SMALL).save(file)
-    told = ["forecast", str(folder), "--out", str(tmp_path), "--no-exr", "--frame", "3", "--model", str(file)]
-    assert cli.main([*told, *(["--mode", mode] if mode else [])]) == 0
+    arguments = ["forecast", str(folder), "--out", str(tmp_path), "--no-exr", "--frame", "3", "--model", str(file)]
+    assert cli.main([*arguments, *(["--mode", mode] if mode else [])]) == 0
     assert [each[1:] for each in network.networks] == [(wanted,)]
     settings = read_forecast(tmp_path).about["settings"]
     assert settings["mode"] == wanted
@@ -85,8 +85,8 @@ def test_the_mode_of_later_frames(
 def test_tables_name_the_mode(
     folder: Path, tmp_path: Path, file: Path, network: Repeater, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = ["forecast", str(folder), "--out", str(tmp_path), "--no-exr", "--compare", "--steps", "1"]
-    assert cli.main([*told, "--model", str(file), "--mode", "compose"]) == 0
+    arguments = ["forecast", str(folder), "--out", str(tmp_path), "--no-exr", "--compare", "--steps", "1"]
+    assert cli.main([*arguments, "--model", str(file), "--mode", "compose"]) == 0
     assert "view source, mean over 1; mode compose" in " ".join(capsys.readouterr().out.split())
 
 
@@ -101,10 +101,10 @@ def test_estimators_see_forecast_frames(
         return lambda image: np.full_like(image[:1], 7.0)
 
     monkeypatch.setattr("vestcl.scene.estimators.DepthEstimator.load", load)
-    told = ["forecast", str(folder), "--no-exr", "--frame", "3", "--model", str(file), "--depth-model", "a/b"]
+    arguments = ["forecast", str(folder), "--no-exr", "--frame", "3", "--model", str(file), "--depth-model", "a/b"]
     for number, options in enumerate(([], ["--perceive", "estimated"], ["--perceive", "splatted"])):
         out = tmp_path / str(number)
-        assert cli.main([*told, "--out", str(out), *options]) == 0
+        assert cli.main([*arguments, "--out", str(out), *options]) == 0
         given, perceived = network.networks[-1][1:], "splatted" if number == 2 else "estimated"
         assert read_forecast(out).about["settings"]["perceive"] == perceived
         assert given[0] == "feedback" and len(given) == (1 if number == 2 else 2)
@@ -124,8 +124,8 @@ def test_estimators_see_forecast_frames(
 def test_what_cannot_be_perceived(
     folder: Path, tmp_path: Path, file: Path, options: list[str], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--model", str(file)]
-    assert cli.main([*told, *options]) == 2
+    arguments = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--model", str(file)]
+    assert cli.main([*arguments, *options]) == 2
     assert words in capsys.readouterr().err
 
 
@@ -138,11 +138,13 @@ def test_without_it_geometry_forecasts(folder: Path, tmp_path: Path, network: Re
     assert not {"model_file", "model_sha256"} & set(about["settings"])
 
 
-def test_the_geometric_one_is_scored_beside_the_networks(
+def test_the_geometric_one_is_scored_next_to_the_networks(
     folder: Path, tmp_path: Path, file: Path, network: Repeater, geometric: Repeater, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = f"forecast {folder} --out {tmp_path} --no-exr --compare --steps 2 --view source --view right --model {file}"
-    assert cli.main(told.split()) == 0
+    arguments = (
+        f"forecast {folder} --out {tmp_path} --no-exr --compare --steps 2 --view source --view right --model {file}"
+    )
+    assert cli.main(arguments.split()) == 0
     assert [call[1:3] for call in (*network.calls, *geometric.calls)] == [(3, 2), (3, 2)]
     about = read_forecast(tmp_path).about
     assert list(about["scores"]["source"]) == ["forecast", "geometric", "repeat last", "optical flow"]
@@ -157,13 +159,13 @@ def test_the_geometric_one_is_scored_beside_the_networks(
     assert rows[at : at + 3] == ["forecast", "geometric", "repeat"]
 
 
-def test_a_shipped_one_is_told_by_its_name(
+def test_a_shipped_one_is_identified_by_its_name(
     folder: Path, tmp_path: Path, file: Path, network: Repeater, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file.rename(file.with_name("vest-s.safetensors"))
     monkeypatch.setattr(shipped, "FOLDER", tmp_path)
-    told = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--no-exr", "--frame", "3"]
-    assert cli.main([*told, "--model", "vest-s"]) == 0
+    arguments = ["forecast", str(folder), "--out", str(tmp_path / "out"), "--no-exr", "--frame", "3"]
+    assert cli.main([*arguments, "--model", "vest-s"]) == 0
     settings = read_forecast(tmp_path / "out").about["settings"]
     assert (settings["model"], settings["model_file"]) == ("vest-s", "vest-s.safetensors")
 
@@ -193,7 +195,7 @@ def test_figures_of_a_right_view_are_whole_in_a_narrow_terminal(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("COLUMNS", "60")
-    told = f"forecast {folder} --out {tmp_path} --no-exr --compare --steps 2 --view right"
-    assert cli.main(told.split()) == 0
+    arguments = f"forecast {folder} --out {tmp_path} --no-exr --compare --steps 2 --view right"
+    assert cli.main(arguments.split()) == 0
     table = capsys.readouterr().out.split("forecast: ")[0]
     assert "oracle" in table and "\u2026" not in table

@@ -44,10 +44,10 @@ class Some:
         ({"height": 10000000}, "--height must be 16,384 or less, got 10000000"),
         ({"height": 16000, "width": 16000}, "--height x --width must be 33,554,432 px or less, got 16000 x 16000"),
         ({"out": Path("file")}, "--out must be a folder, got the file file"),
-        ({"out": Path("file/below/it")}, "--out file/below/it: can't be made, since .*file is no folder"),
+        ({"out": Path("file/below/it")}, "--out file/below/it: can't be made, since .*file is not a folder"),
         ({"out": Path("n" * 300)}, "--out nn.*: File name too long"),
         ({"json": Path("folder")}, "--json must be a file, got the folder folder"),
-        ({"json": Path("file/x.json")}, "--json file/x.json: can't be made, since .*file is no folder"),
+        ({"json": Path("file/x.json")}, "--json file/x.json: can't be made, since .*file is not a folder"),
     ],
 )
 def test_what_is_refused(given: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,7 +104,7 @@ def test_empty_arguments(arguments: list[str], message: str, capsys: pytest.Capt
         ("`depth` must be finite", "`depth` must be finite"),  # some function's: it was not given
         ("a/camera.json: `steps` must be a number", "a/camera.json: `steps` must be a number"),
         ("camera.json: no such file; write one, or give `fov` in degrees", None),
-        ("camera.json: tells the camera; leave out `fov`", "camera.json: tells the camera; leave out --fov"),
+        ("camera.json: defines the camera; leave out `fov`", "camera.json: defines the camera; leave out --fov"),
         ("x: is a street, which takes height, width, not fov, rig", "x: is a street, which takes --height, --width, "),
         ("x: is a street; it does not take label_ids", "x: is a street; it does not take --label-ids"),
         ("`view` '0,0,0,fov=200': its `fov` must be below 180", "--view '0,0,0,fov=200': its `fov` must be below 180"),

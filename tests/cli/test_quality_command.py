@@ -1,4 +1,4 @@
-"""`vestcl forecast --quality`: which level the network gets, and what forecast.json tells of it."""
+"""`vestcl forecast --quality`: which level the network gets, and what forecast.json says of it."""
 
 import dataclasses
 from pathlib import Path
@@ -27,8 +27,8 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Repeater:
 def test_the_network_gets_what_was_asked_for(level: Quality | None, tmp_path: Path, network: Repeater) -> None:
     Forecaster(SMALL).save(tmp_path / "small.safetensors")
     clip, out = write_clip(tmp_path / "clip"), tmp_path / "out"
-    told = f"forecast {clip} --out {out} --frame 3 --no-exr --model {tmp_path / 'small.safetensors'}".split()
-    assert cli.main([*told, *([] if level is None else ["--quality", level])]) == 0
+    arguments = f"forecast {clip} --out {out} --frame 3 --no-exr --model {tmp_path / 'small.safetensors'}".split()
+    assert cli.main([*arguments, *([] if level is None else ["--quality", level])]) == 0
     wanted = level or quality.USUAL
     ((model, _),) = network.networks
     autocast = model.options.autocast  # None on processors without bfloat16

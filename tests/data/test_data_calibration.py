@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_files import picture, pose, row, write_pictures, write_text
+from data_files import picture, pose, row, write_images, write_text
 
 from vestcl import io
 from vestcl.data import calibration
@@ -95,7 +95,7 @@ def test_calibration_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"no\.txt: No such file"):
         files.Calibration(tmp_path / "no.txt")
     (tmp_path / "binary.txt").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match=r"binary\.txt: is no text"):
+    with pytest.raises(ValueError, match=r"binary\.txt: is not text"):
         files.Calibration(tmp_path / "binary.txt")
 
 
@@ -106,7 +106,7 @@ def test_projection_that_is_no_camera(tmp_path: Path) -> None:
 
 
 def test_numbered_images(tmp_path: Path) -> None:
-    write_pictures(tmp_path / "a", ["rgb_00009.jpg", "rgb_00010.png", ".rgb_00011.png"])
+    write_images(tmp_path / "a", ["rgb_00009.jpg", "rgb_00010.png", ".rgb_00011.png"])
     write_text(tmp_path / "a" / "notes.txt")
     found = files.numbered_images(tmp_path / "a", "rgb_")
     assert [(number, file.name) for number, file in found.items()] == [(9, "rgb_00009.jpg"), (10, "rgb_00010.png")]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from data_files import write_pictures, write_text
+from data_files import write_images, write_text
 
 from vestcl.data.readers.camera_file import read_camera
 from vestcl.data.readers.folder import open_folder
@@ -42,9 +42,9 @@ def test_numbers_beyond_all_cameras(tmp_path: Path, key: str, value: float) -> N
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"fx": NaN, "fy": 1, "cx": 1, "cy": 1}', r"is no JSON \(NaN is no number in JSON\)"),
-        ('{"fx": Infinity}', r"is no JSON \(Infinity is no number in JSON\)"),
-        ('{"fx": -Infinity}', r"is no JSON \(-Infinity is no number in JSON\)"),
+        ('{"fx": NaN, "fy": 1, "cx": 1, "cy": 1}', r"is no JSON \(NaN is not a number in JSON\)"),
+        ('{"fx": Infinity}', r"is no JSON \(Infinity is not a number in JSON\)"),
+        ('{"fx": -Infinity}', r"is no JSON \(-Infinity is not a number in JSON\)"),
         ('{"fx": 1e999, "fy": 1, "cx": 1, "cy": 1}', "`fx` must be at most"),
         ('{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "fx": 2}', r"is no JSON \(the key 'fx' is there twice\)"),
         ("[" * 100_000, r"is no JSON \(nested too deeply\)"),
@@ -67,7 +67,7 @@ def test_texts(tmp_path: Path, text: str, message: str) -> None:
 
 
 def test_what_is_no_file(tmp_path: Path) -> None:
-    write_pictures(tmp_path / "image", ["a.png"])
+    write_images(tmp_path / "image", ["a.png"])
     path = tmp_path / "camera.json"
     path.mkdir()
     with pytest.raises(ValueError, match=r"camera\.json: Is a directory"):
@@ -82,7 +82,7 @@ def test_what_is_no_file(tmp_path: Path) -> None:
         open_folder(tmp_path)
     path.unlink()
     path.write_bytes(b"\xff\xfe{")
-    with pytest.raises(ValueError, match=r"camera\.json: is no JSON"):
+    with pytest.raises(ValueError, match=r"camera\.json: is not JSON"):
         open_folder(tmp_path)
 
 
@@ -130,7 +130,7 @@ def mutated(rng: np.random.Generator) -> str:
 def test_fuzz(tmp_path: Path) -> None:
     """Opened with a camera that is one, or refused in one line that names the file; seeds 0 to 599."""
     for kind in ("image", "right"):
-        write_pictures(tmp_path / kind, ["a.png"])
+        write_images(tmp_path / kind, ["a.png"])
     path, opened, messages = tmp_path / "camera.json", 0, []
     for seed in range(600):
         path.write_text(mutated(np.random.default_rng(seed)), encoding="utf-8")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_files import picture, write_pictures, write_text
+from data_files import picture, write_images, write_text
 
 from vestcl import io
 from vestcl.data.readers.cityscapes import is_frame, open_cityscapes, snippets
@@ -18,11 +18,11 @@ CAMERA = {
 
 
 def tree(tmp_path: Path, name: str = NAME, side: str = "left", frames: range = range(-19, 11)) -> Path:
-    """ROOT with one snippet, its pictures 64 times smaller than the original ones."""
+    """ROOT with one snippet, its images 64 times smaller than the original ones."""
     city, sequence, annotated = name.split("_")
     folder = tmp_path / f"{side}Img8bit_sequence" / "val" / city
     names = [f"{city}_{sequence}_{int(annotated) + i:06}_{side}Img8bit.png" for i in frames]
-    write_pictures(folder, names, 16, 32)
+    write_images(folder, names, 16, 32)
     write_text(tmp_path / "camera" / "val" / city / f"{name}_camera.json", json.dumps(CAMERA))
     return tmp_path
 
@@ -60,7 +60,7 @@ def test_right_camera(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("folder", ["disparity", "disparity_sequence"])
 def test_depth_from_disparity(tmp_path: Path, folder: str) -> None:
-    """p = 2561: 10 px of the 2048 pixels wide image, whatever this picture's width."""
+    """p = 2561: 10 px of the 2048 pixels wide image, whatever this image's width."""
     tree(tmp_path)
     path = tmp_path / folder / "val" / "frankfurt" / f"{NAME}_disparity.png"
     io.write_pixels(path, np.full((16, 32), 2561, np.uint16))
@@ -115,13 +115,13 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
     tree(tmp_path)
     camera = tmp_path / "camera" / "val" / "frankfurt" / f"{NAME}_camera.json"
     for content, message in [
-        ("{", "is no Cityscapes camera file"),
-        ("[1]", "is no Cityscapes camera file"),
+        ("{", "is not a Cityscapes camera file"),
+        ("[1]", "is not a Cityscapes camera file"),
         ("{}", "has no 'intrinsic'"),
         (json.dumps(CAMERA | {"extrinsic": {}}), "has no 'baseline'"),
         (json.dumps(CAMERA | {"extrinsic": {"baseline": 0}}), "`baseline` must be positive, got 0"),
         (json.dumps(CAMERA | {"intrinsic": CAMERA["intrinsic"] | {"fx": -1}}), "K must be finite"),
-        (json.dumps(CAMERA | {"intrinsic": CAMERA["intrinsic"] | {"fx": "wide"}}), "is no Cityscapes camera file"),
+        (json.dumps(CAMERA | {"intrinsic": CAMERA["intrinsic"] | {"fx": "wide"}}), "is not a Cityscapes camera file"),
     ]:
         camera.write_text(content)
         with pytest.raises(ValueError, match=rf"{NAME}_camera\.json: {message}"):

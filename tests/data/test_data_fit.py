@@ -11,7 +11,7 @@ import test_data_folder
 import test_data_kitti_odometry
 import test_data_kitti_raw
 import test_data_virtual_kitti
-from data_files import picture, row, write_pictures, write_text
+from data_files import picture, row, write_images, write_text
 
 from vestcl import io
 from vestcl.data import fit
@@ -31,14 +31,14 @@ def settled(message: str, folder: Path, size: tuple[int, int]) -> Clip:
     """The clip of images of ``size`` with the camera.json that an error's text has."""
     (text,) = re.findall(r"\{[^{}]*\}", message.split(" if they were cropped")[0])
     write_text(folder / "camera.json", text)
-    write_pictures(folder / "image", ["0.png"], *size)
+    write_images(folder / "image", ["0.png"], *size)
     return open_folder(folder)
 
 
 def kitti_raw(tmp_path: Path, size: tuple[int, int], name: str = "2011_09_26_drive_0060_sync") -> Path:
     path = test_data_kitti_raw.drive(tmp_path, 2)
     for camera in ("02", "03"):
-        write_pictures(path / f"image_{camera}" / "data", [f"{i:010}.png" for i in range(2)], *size)
+        write_images(path / f"image_{camera}" / "data", [f"{i:010}.png" for i in range(2)], *size)
     return path.rename(path.with_name(name))
 
 
@@ -58,7 +58,7 @@ def test_kitti_raw_resized(tmp_path: Path, size: tuple[int, int]) -> None:
 
 def test_kitti_raw_sides_of_their_own(tmp_path: Path) -> None:
     path = kitti_raw(tmp_path, (94, 310))
-    write_pictures(path / "image_03" / "data", [f"{i:010}.png" for i in range(2)], 188, 621)
+    write_images(path / "image_03" / "data", [f"{i:010}.png" for i in range(2)], 188, 621)
     sample = open_sequence(path)[0]
     assert sample.right is not None
     np.testing.assert_allclose(sample.K, scaled(KITTI, 310 / 1242, 94 / 375))
@@ -68,7 +68,7 @@ def test_kitti_raw_sides_of_their_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize("size", [(200, 640), (375, 1000), (256, 1242), (375, 1224)])
 def test_kitti_raw_of_other_proportions(tmp_path: Path, size: tuple[int, int]) -> None:
     path = kitti_raw(tmp_path, size)
-    numbers = rf"`P_rect_02`: is for pictures of \(375, 1242\) \(height, width\), but they are \({size[0]}, {size[1]}\)"
+    numbers = rf"`P_rect_02`: is for images of \(375, 1242\) \(height, width\), but they are \({size[0]}, {size[1]}\)"
     with pytest.raises(ValueError, match=numbers) as error:
         open_sequence(path)
     clip = settled(str(error.value), tmp_path / "settled", size)
@@ -77,8 +77,8 @@ def test_kitti_raw_of_other_proportions(tmp_path: Path, size: tuple[int, int]) -
 
 def test_kitti_raw_with_a_right_camera_of_other_proportions(tmp_path: Path) -> None:
     path = kitti_raw(tmp_path, (94, 310))
-    write_pictures(path / "image_03" / "data", ["0000000000.png"], 94, 200)
-    with pytest.raises(ValueError, match="`P_rect_03`: is for pictures of"):
+    write_images(path / "image_03" / "data", ["0000000000.png"], 94, 200)
+    with pytest.raises(ValueError, match="`P_rect_03`: is for images of"):
         open_sequence(path)
 
 
@@ -111,7 +111,7 @@ def test_kitti_raw_without_s_rect(tmp_path: Path) -> None:
     cameras = path.parent / "calib_cam_to_cam.txt"
     lines = [line for line in cameras.read_text().splitlines() if not line.startswith("S_")]
     cameras.write_text("\n".join(lines))
-    with pytest.raises(ValueError, match=r"`P_rect_02`: is for pictures of \(375, 1242\)") as error:
+    with pytest.raises(ValueError, match=r"`P_rect_02`: is for images of \(375, 1242\)") as error:
         open_sequence(path)
     np.testing.assert_allclose(settled(str(error.value), tmp_path / "s", (188, 621))[0].K, scaled(KITTI, .5, 188 / 375),
                                atol=1e-3)  # fmt: skip
@@ -129,7 +129,7 @@ def test_laser_scans_follow_the_size(tmp_path: Path) -> None:
     scan.write_bytes(np.array(points, "<f4").tobytes())
     places = []
     for size in ((94, 310), (188, 621)):
-        write_pictures(path / "image_02" / "data", [f"{i:010}.png" for i in range(2)], *size)
+        write_images(path / "image_02" / "data", [f"{i:010}.png" for i in range(2)], *size)
         depth = open_sequence(path)[0].read_depth()
         (at,) = np.argwhere(depth[0])
         K = scaled(KITTI, size[1] / 1242, size[0] / 375)
@@ -156,7 +156,7 @@ def test_odometry_of_published_sizes(tmp_path: Path, numbers: tuple[float, ...],
     K = intrinsics(numbers[0], *numbers)
     np.testing.assert_allclose(open_sequence(odometry(tmp_path, K, size))[0].K[:2, 2], np.add(numbers[1:], 0.5))
     half = (size[0] // 2, size[1] // 2)
-    with pytest.raises(ValueError, match=rf"`P2`: is for pictures of \({size[0]}, {size[1]}\)") as error:
+    with pytest.raises(ValueError, match=rf"`P2`: is for images of \({size[0]}, {size[1]}\)") as error:
         open_sequence(odometry(tmp_path, K, half))
     found = settled(str(error.value), tmp_path / "settled", half)[0].K
     np.testing.assert_allclose(found[0], [half[1] / size[1] * numbers[0], 0, half[1] / size[1] * (numbers[1] + 0.5)],
@@ -189,13 +189,13 @@ def test_odometry_of_a_plausible_camera(tmp_path: Path) -> None:
 def test_virtual_kitti(tmp_path: Path) -> None:
     folder = test_data_virtual_kitti.tree(tmp_path)
     rgb = folder / "frames" / "rgb"
-    write_pictures(rgb / "Camera_1", [f"rgb_{i:05}.jpg" for i in range(3)], 20, 66)
+    write_images(rgb / "Camera_1", [f"rgb_{i:05}.jpg" for i in range(3)], 20, 66)
     sample = open_sequence(folder)[0]
     full = np.array([[725.0087, 0, 621], [0, 725.0087, 187.5], [0, 0, 1]])
     assert sample.right is not None
     np.testing.assert_allclose(sample.right.K, scaled(full, 66 / 1242, 20 / 375))
-    write_pictures(rgb / "Camera_0", [f"rgb_{i:05}.jpg" for i in range(3)], 10, 30)
-    with pytest.raises(ValueError, match=r"intrinsic\.txt: frame 0 of camera 0: is for pictures of \(375, 1242\)"):
+    write_images(rgb / "Camera_0", [f"rgb_{i:05}.jpg" for i in range(3)], 10, 30)
+    with pytest.raises(ValueError, match=r"intrinsic\.txt: frame 0 of camera 0: is for images of \(375, 1242\)"):
         open_sequence(folder)
 
 
@@ -205,7 +205,7 @@ def test_cityscapes(tmp_path: Path) -> None:
     folder = tmp_path / "leftImg8bit_sequence" / "val" / "frankfurt"
     for path in folder.iterdir():
         io.write_pixels(path, picture(400, 1024))
-    with pytest.raises(ValueError, match=r"_camera\.json: is for pictures of \(1024, 2048\).*cy = 513\.137 - rows cut"):
+    with pytest.raises(ValueError, match=r"_camera\.json: is for images of \(1024, 2048\).*cy = 513\.137 - rows cut"):
         open_sequence(tmp_path)
 
 
@@ -226,7 +226,7 @@ def test_a_folder_of_resized_images(tmp_path: Path) -> None:
         ({"cx": 6.5}, "is far from the middle of the images, .*width.: WIDTH"),
         ({"fx": 1e5}, r"fx must be 0\.08 \.\.\. 8000 px"),
         ({"fy": 1e-5}, r"fy must be 0\.06 \.\.\. 6000 px"),
-        ({"width": 9, "height": 6}, r"is for pictures of \(6, 9\) \(height, width\), but they are \(6, 8\)"),
+        ({"width": 9, "height": 6}, r"is for images of \(6, 9\) \(height, width\), but they are \(6, 8\)"),
         ({"width": 960}, "must have both `width` and `height`, or neither, got `width` only"),
         ({"height": 6}, "must have both `width` and `height`, or neither, got `height` only"),
         ({"width": 8.5, "height": 6}, "`width` and `height` must be whole numbers"),
@@ -241,8 +241,8 @@ def test_a_folder_with_published_numbers(tmp_path: Path) -> None:
     """KITTI's K without its size, images of 0.82 of it: near enough to the middle, and wrong."""
     numbers = {"fx": 721.5377, "fy": 721.5377, "cx": 609.5593, "cy": 172.854}
     path = test_data_folder.folder(tmp_path, **numbers)
-    write_pictures(path / "image", ["a.png", "b.png", "c.png"], 309, 1024)
-    with pytest.raises(ValueError, match=r"camera\.json: is for pictures of \(375, 1242\)") as error:
+    write_images(path / "image", ["a.png", "b.png", "c.png"], 309, 1024)
+    with pytest.raises(ValueError, match=r"camera\.json: is for images of \(375, 1242\)") as error:
         open_folder(path)
     K = settled(str(error.value), tmp_path / "settled", (309, 1024))[0].K
     np.testing.assert_allclose(K, scaled(KITTI, 1024 / 1242, 309 / 375), atol=1e-3)
@@ -272,12 +272,12 @@ def test_off_the_middle_where_the_size_is_stated(tmp_path: Path) -> None:
 )
 def test_a_right_camera_of_another_size(tmp_path: Path, more: dict[str, object], expected: list[list[float]]) -> None:
     path = test_data_folder.folder(tmp_path, baseline=0.5, **more)
-    write_pictures(path / "right", ["a.png", "b.png", "c.png"], 12, 16)
+    write_images(path / "right", ["a.png", "b.png", "c.png"], 12, 16)
     sample = open_folder(path)[0]
     assert sample.right is not None
     np.testing.assert_allclose(sample.right.K, expected)
-    write_pictures(path / "right", ["a.png", "b.png", "c.png"], 12, 12)
-    with pytest.raises(ValueError, match=r"camera\.json: (is for pictures of|its principal point)"):
+    write_images(path / "right", ["a.png", "b.png", "c.png"], 12, 12)
+    with pytest.raises(ValueError, match=r"camera\.json: (is for images of|its principal point)"):
         open_folder(path)
 
 
@@ -315,7 +315,7 @@ def test_maps_of_about_the_same_proportions(tmp_path: Path) -> None:
         io.write_depth(path / "depth" / f"{name}.png", np.full((375, 1242), 5.0), 256)
     assert (open_folder(path)[0].read_depth() == 5).all()
     io.write_depth(path / "depth" / "a.png", np.full((375, 1200), 5.0), 256)
-    with pytest.raises(ValueError, match="must have the proportions of the picture"):
+    with pytest.raises(ValueError, match="must have the proportions of the image"):
         open_folder(path)[0].read_depth()
 
 
@@ -330,5 +330,5 @@ def test_factors_that_agree_scale_and_others_do_not(seed: int) -> None:
     if abs(sx / sy - 1) <= 0.0099:
         np.testing.assert_allclose(fit.fit_intrinsics(K, calibrated, size, "x"), scaled(K, sx, sy))
     wrong = size[0], round(size[1] * 1.03) + 1
-    with pytest.raises(ValueError, match="is for pictures of"):
+    with pytest.raises(ValueError, match="is for images of"):
         fit.fit_intrinsics(K, calibrated, wrong, "x")

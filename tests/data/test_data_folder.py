@@ -1,4 +1,4 @@
-"""vestcl.data.readers.folder: pictures with one camera.json."""
+"""vestcl.data.readers.folder: images with one camera.json."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from data_files import picture, pose, real, row, write_pictures, write_text
+from data_files import picture, pose, real, row, write_images, write_text
 
 from vestcl import io
 from vestcl.data.readers.folder import open_folder, read_camera
@@ -17,12 +17,12 @@ CAMERA: dict[str, Any] = {"fx": 70.0, "fy": 71, "cx": 4.0, "cy": 3.0}
 
 def folder(tmp_path: Path, where: str = "image", **camera: object) -> Path:
     write_text(tmp_path / "camera.json", json.dumps(CAMERA | camera))
-    write_pictures(tmp_path / where, ["a.png", "b.png", "c.png"])
+    write_images(tmp_path / where, ["a.png", "b.png", "c.png"])
     return tmp_path
 
 
 @pytest.mark.parametrize("where", ["image", "images", "left", "."])
-def test_pictures(tmp_path: Path, where: str) -> None:
+def test_images(tmp_path: Path, where: str) -> None:
     clip = open_folder(folder(tmp_path, where))
     assert (clip.kind, clip.name, [s.name for s in clip]) == ("folder", tmp_path.name, ["a", "b", "c"])
     assert np.array_equal(clip[1].read_image(), io.to_float(picture(seed=1)))
@@ -37,10 +37,10 @@ def test_half_a_pixel(tmp_path: Path, centre: dict[str, str], added: float) -> N
     assert K.tolist() == [[70, 0, 4 + added], [0, 71, 3 + added], [0, 0, 1]]
 
 
-def test_all_that_may_lie_beside(tmp_path: Path) -> None:
+def test_all_that_may_lie_next_to_it(tmp_path: Path) -> None:
     right = {"fx": 60, "fy": 61, "cx": 3, "cy": 2}
     path = folder(tmp_path, depth_scale=100, label_ids="trainIds", baseline=0.4, right=right, fps=12.5)
-    write_pictures(path / "right", ["a.jpg", "c.png"])
+    write_images(path / "right", ["a.jpg", "c.png"])
     io.write_depth(path / "depth" / "a.png", np.full((6, 8), 2.5), 100)
     io.write_depth(path / "depth" / "b.npy", np.full((6, 8), 2.5), 100)
     io.write_pixels(path / "labels" / "b.png", np.full((6, 8), 13, np.uint8))
@@ -59,7 +59,7 @@ def test_all_that_may_lie_beside(tmp_path: Path) -> None:
 
 def test_field_of_view_in_place_of_a_camera(tmp_path: Path) -> None:
     path = folder(tmp_path)
-    with pytest.raises(ValueError, match=r"camera\.json: tells the camera; leave out `fov`"):
+    with pytest.raises(ValueError, match=r"camera\.json: defines the camera; leave out `fov`"):
         open_folder(path, fov=90)
     (path / "camera.json").unlink()
     np.testing.assert_allclose(open_folder(path, fov=90)[0].K, [[4, 0, 4], [0, 4, 3], [0, 0, 1]])
@@ -78,7 +78,7 @@ def test_field_of_view_in_place_of_a_camera(tmp_path: Path) -> None:
         ({"fps": 0}, "`fps` must be a positive number, got 0"),
         ({"baseline": "0.5"}, "`baseline` must be a positive number, got '0.5'"),
         ({"right": {"fx": 1}}, "`right` must have fx, fy, cx, cy and nothing else"),
-        ({"width": 9, "height": 6}, r"is for pictures of \(6, 9\) \(height, width\), but they are \(6, 8\)"),
+        ({"width": 9, "height": 6}, r"is for images of \(6, 9\) \(height, width\), but they are \(6, 8\)"),
     ],
 )
 def test_bad_cameras_are_named(tmp_path: Path, camera: dict[str, object], message: str) -> None:
@@ -95,12 +95,12 @@ def test_no_json(tmp_path: Path, text: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("file", "message"),
     [
-        ("depth/a.png", r"camera\.json: must tell `depth_scale`, file units per metre, for .*a\.png"),
-        ("labels/a.png", r"camera\.json: must tell `label_ids` for .*a\.png"),
-        ("right/a.png", r"camera\.json: must tell `baseline` in metres for .*a\.png"),
+        ("depth/a.png", r"camera\.json: must contain `depth_scale`, file units per metre, for .*a\.png"),
+        ("labels/a.png", r"camera\.json: must contain `label_ids` for .*a\.png"),
+        ("right/a.png", r"camera\.json: must contain `baseline` in metres for .*a\.png"),
     ],
 )
-def test_what_camera_json_must_tell(tmp_path: Path, file: str, message: str) -> None:
+def test_what_camera_json_must_contain(tmp_path: Path, file: str, message: str) -> None:
     path = folder(tmp_path)
     io.write_pixels(path / file, np.zeros((6, 8), np.uint8))
     with pytest.raises(ValueError, match=message):
@@ -114,15 +114,15 @@ def test_tables_of_another_length(tmp_path: Path) -> None:
         open_folder(path)
 
 
-def test_pictures_of_several_sizes(tmp_path: Path) -> None:
+def test_images_of_several_sizes(tmp_path: Path) -> None:
     path = folder(tmp_path)
     io.write_pixels(path / "image" / "b.png", picture(7, 8))
     with pytest.raises(ValueError, match=r"b\.png: must be 6 x 8 as its clip is, got 7 x 8"):
         open_folder(path)[1].read_image()
 
 
-def test_no_pictures(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"has no pictures, neither beside camera\.json nor in image, images, left"):
+def test_no_images(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"has no images, neither next to camera\.json nor in image, images, left"):
         open_folder(tmp_path)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_files import pose, real, row, write_pictures, write_text
+from data_files import pose, real, row, write_images, write_text
 
 from vestcl.data.readers.kitti_odometry import open_kitti_odometry
 from vestcl.data.readers.splits import windows
@@ -22,7 +22,7 @@ def tree(tmp_path: Path, cameras: str = "0123") -> Path:
     lines = [f"P{i}: {row(np.column_stack([K, K @ shift]))}" for i, shift in enumerate(SHIFTS)]
     write_text(folder / "calib.txt", *lines, f"Tr: {row(pose()[:3])}")
     for camera in cameras:
-        write_pictures(folder / f"image_{camera}", [f"{i:06}.png" for i in range(4)], 10, 30)
+        write_images(folder / f"image_{camera}", [f"{i:06}.png" for i in range(4)], 10, 30)
     write_text(folder / "times.txt", "0.0", "1.0e-01", "0.2", "0.3")
     write_text(tmp_path / "poses" / "03.txt", *(row(p[:3]) for p in POSES))
     return folder
@@ -104,7 +104,7 @@ def test_bad_files_are_named(tmp_path: Path, file: str, content: str | None, mes
 
 
 def test_real_sequence() -> None:
-    """Grey, 10 Hz, a baseline of 0.537 m, about 1.2 m a frame straight on."""
+    """Grey, 10 Hz, a baseline of 0.537 m, about 1.2 m per frame straight on."""
     clip = open_kitti_odometry(real("kitti_odometry"))
     assert (clip.name, len(clip), len(list(windows(len(clip))))) == ("06", 36, 28)
     assert clip.fps == pytest.approx(10)

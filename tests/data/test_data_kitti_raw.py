@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_files import pose, row, write_pictures, write_text
+from data_files import pose, row, write_images, write_text
 
 from vestcl import io
 from vestcl.data.readers.kitti_raw import EARTH_RADIUS, mercator_pose, open_kitti_raw
@@ -42,7 +42,7 @@ def drive(tmp_path: Path, frames: int = 3) -> Path:
     write_text(date / "calib_imu_to_velo.txt", "calib_time: 25-May-2012", f"R: {identity}", "T: 0 0 0")
     names = [f"{i:010}.png" for i in range(frames)]
     for camera in ("02", "03"):
-        write_pictures(path / f"image_{camera}" / "data", names, *SIZE)
+        write_images(path / f"image_{camera}" / "data", names, *SIZE)
     for i in range(frames):
         write_text(path / "oxts" / "data" / f"{i:010}.txt", oxts(0.8 * i, 0.05 * i))
     times = [f"2011-09-26 13:02:25.{1 + i}64389445" for i in range(frames)]
@@ -111,7 +111,7 @@ def test_depth_from_the_scanner(tmp_path: Path) -> None:
     cameras = path.parent / "calib_cam_to_cam.txt"
     text = cameras.read_text().replace(P2, "40 0 30.5 4 0 40 10.5 0 0 0 1 0")  # of 20 x 60 pixels, twice the images'
     cameras.write_text(text.replace("S_rect_02: 1.242000e+03 3.750000e+02", "S_rect_02: 60 20"))
-    write_pictures(path / "image_02" / "data", [f"{i:010}.png" for i in range(3)], 10, 30)
+    write_images(path / "image_02" / "data", [f"{i:010}.png" for i in range(3)], 10, 30)
     points = [(10, 0, 0, 0.5), (12, 0, 0, 0.5), (-10, 0, 0, 0.5), (5, -1, 0.5, 0.5), (1, 50, 0, 0.5)]
     scan = path / "velodyne_points" / "data" / "0000000001.bin"
     scan.parent.mkdir(parents=True)
@@ -159,7 +159,7 @@ def test_without_what_may_be_missing(tmp_path: Path) -> None:
 
 def test_grey_cameras(tmp_path: Path) -> None:
     path = drive(tmp_path, 1)
-    write_pictures(path / "image_00" / "data", ["0000000000.png"], 10, 30)
+    write_images(path / "image_00" / "data", ["0000000000.png"], 10, 30)
     with pytest.raises(ValueError, match=r"calib_cam_to_cam\.txt: has no entry `P_rect_00`"):
         open_kitti_raw(path, rig="grey")
     write_text(path.parent / "calib_cam_to_cam.txt", "P_rect_00: 700 0 15 0 0 700 5 0 0 0 1 0", "R_rect_00: " +
@@ -185,7 +185,7 @@ def test_grey_cameras(tmp_path: Path) -> None:
         ("oxts/data/0000000001.txt", "1 2 3", r"0000000001\.txt: line 1 must be 30 finite numbers"),
         ("oxts/data/0000000001.txt", None, r"0000000001\.txt: No such file"),
         ("image_02/timestamps.txt", "2011-09-26 13:02:25.1", r"timestamps\.txt: must have a date and time for each of"),
-        ("image_02/data/0000000000.png", "hello", r"0000000000\.png: is no image"),
+        ("image_02/data/0000000000.png", "hello", r"0000000000\.png: is not an image"),
         ("image_02/data/0000000001.png", None, r"the frame after 0000000000\.png is missing"),
     ],
 )
@@ -199,6 +199,6 @@ def test_bad_files_are_named(tmp_path: Path, file: str, content: str | None, mes
         open_kitti_raw(path)
 
 
-def test_no_pictures(tmp_path: Path) -> None:
+def test_no_images(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"has no image_02/data/\*\.png"):
         open_kitti_raw(tmp_path)

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from data_files import picture, write_pictures, write_text
+from data_files import picture, write_images, write_text
 
 from vestcl import io
 from vestcl.data.lens import UndistortedImage
@@ -166,7 +166,7 @@ def test_the_right_camera_has_a_lens_of_its_own(tmp_path: Path) -> None:
 
 def test_coefficients_of_zero_change_no_bit(tmp_path: Path) -> None:
     write_text(tmp_path / "camera.json", json.dumps(PINHOLE | {"distortion": "opencv", "k1": 0, "k2": 0.0, "p1": 0}))
-    write_pictures(tmp_path / "image", ["a.png"], HEIGHT, WIDTH)
+    write_images(tmp_path / "image", ["a.png"], HEIGHT, WIDTH)
     sample = open_folder(tmp_path)[0]
     assert isinstance(sample.image, ImageFile)
     assert np.array_equal(sample.read_image(), io.to_float(picture(HEIGHT, WIDTH)))
@@ -193,7 +193,7 @@ def test_coefficients_of_zero_change_no_bit(tmp_path: Path) -> None:
 )
 def test_lenses_that_are_refused(tmp_path: Path, lens: dict[str, Any], message: str) -> None:
     write_text(tmp_path / "camera.json", json.dumps(PINHOLE | lens))
-    write_pictures(tmp_path / "image", ["a.png"], HEIGHT, WIDTH)
+    write_images(tmp_path / "image", ["a.png"], HEIGHT, WIDTH)
     with pytest.raises(ValueError, match=rf"camera\.json: {message}"):
         open_folder(tmp_path)
 
@@ -201,7 +201,7 @@ def test_lenses_that_are_refused(tmp_path: Path, lens: dict[str, Any], message: 
 def test_a_lens_that_folds_shows_nothing_twice(tmp_path: Path) -> None:
     """r (1 - 0.9 r^2) grows up to r = 0.61: farther out the polynomial comes back, the lens does not."""
     write_text(tmp_path / "camera.json", json.dumps(PINHOLE | {"k1": -0.9}))
-    write_pictures(tmp_path / "image", ["a.png"], HEIGHT, WIDTH)
+    write_images(tmp_path / "image", ["a.png"], HEIGHT, WIDTH)
     sample, (x, y) = open_folder(tmp_path)[0], pinhole()
     outside, radius, last = sample.read_ego_vehicle()[0], np.hypot(x, y), (1 / 2.7) ** 0.5
     assert outside[radius > last + 0.001].all() and not outside[radius < last - 0.001].any() and outside.any()

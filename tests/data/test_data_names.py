@@ -12,7 +12,7 @@ import test_data_folder
 import test_data_kitti_odometry
 import test_data_kitti_raw
 import test_data_virtual_kitti
-from data_files import picture, write_pictures, write_text
+from data_files import picture, write_images, write_text
 
 from vestcl import io
 from vestcl.data.open import open_sequence
@@ -24,7 +24,7 @@ CAMERA = {"fx": 70.0, "fy": 71, "cx": 4.0, "cy": 3.0, "depth_scale": 100, "label
 
 def folder(tmp_path: Path, names: list[str], where: str = "image") -> Path:
     write_text(tmp_path / "camera.json", json.dumps(CAMERA))
-    write_pictures(tmp_path / where, names)
+    write_images(tmp_path / where, names)
     return tmp_path
 
 
@@ -96,7 +96,7 @@ def test_a_png_depth_in_capitals_needs_its_scale(tmp_path: Path) -> None:
     path = folder(tmp_path, ["0.png"])
     (path / "camera.json").write_text(json.dumps({key: CAMERA[key] for key in ("fx", "fy", "cx", "cy")}))
     io.write_depth(path / "depth" / "0.PNG", np.full((6, 8), 3.0), 100)
-    with pytest.raises(ValueError, match="must tell `depth_scale`"):
+    with pytest.raises(ValueError, match="must contain `depth_scale`"):
         open_folder(path)
 
 
@@ -134,7 +134,7 @@ def test_two_files_of_one_name(tmp_path: Path, kind: str) -> None:
 
 def test_png_and_jpeg_of_one_number(tmp_path: Path) -> None:
     path = test_data_kitti_raw.drive(tmp_path)
-    write_pictures(path / "image_02" / "data", ["0000000001.jpg"], 10, 33)
+    write_images(path / "image_02" / "data", ["0000000001.jpg"], 10, 33)
     with pytest.raises(ValueError, match=r"0000000001\.png: has the name of 0000000001\.jpg"):
         open_sequence(path)
 
@@ -209,7 +209,7 @@ def test_scans(tmp_path: Path) -> None:
         open_sequence(path)
 
 
-# ---------------------------------------------------------------- what is no file
+# ---------------------------------------------------------------- what is not a file
 
 
 @pytest.mark.parametrize("kind", ["image", "right", "depth", "labels"])

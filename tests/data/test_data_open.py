@@ -1,4 +1,4 @@
-"""vestcl.data.open: the layout tells the reader; and vestcl.data.readers.video."""
+"""vestcl.data.open: the layout selects the reader; and vestcl.data.readers.video."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -52,16 +52,16 @@ def test_options_go_to_the_reader(tmp_path: Path) -> None:
         open_sequence(path, fov=60)
 
 
-def test_what_was_looked_for_is_told(tmp_path: Path) -> None:
+def test_what_was_looked_for_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"nowhere: no such file or folder"):
         open_sequence(tmp_path / "nowhere")
     with pytest.raises(
-        ValueError, match=r"is no clip that vestcl knows\. It looked for video: .* KITTI raw: image_02/data"
+        ValueError, match=r"unrecognised dataset layout\. It looked for video: .* KITTI raw: image_02/data"
     ) as e:
         open_sequence(tmp_path)
     for layout in ("KITTI odometry: calib.txt", "Cityscapes: leftImg8bit_sequence", "frames/rgb", "camera.json"):
         assert layout in str(e.value)
-    with pytest.raises(ValueError, match=r"notes\.txt: is no clip"):
+    with pytest.raises(ValueError, match=r"notes\.txt: is not a clip"):
         open_sequence(write_text(tmp_path / "notes.txt", "hello"))
 
 
@@ -114,7 +114,7 @@ def test_a_video_with_oblong_pixels(tmp_path: Path, degrees: int) -> None:
     assert resized.read_image().shape == (3, 16, 100)
 
 
-def test_pictures_without_a_camera(tmp_path: Path) -> None:
+def test_images_without_a_camera(tmp_path: Path) -> None:
     path = test_data_folder.folder(tmp_path)
     (path / "camera.json").unlink()
     with pytest.raises(ValueError, match=r"camera\.json: no such file; .* or give `fov` in degrees"):

@@ -96,7 +96,7 @@ def test_files_are_read_when_asked(tmp_path: Path) -> None:
     assert made.read_depth().tolist() == [[[2.0] * 8] * 6]
     with pytest.raises(ValueError, match=r"wrong\.png: must be 6 x 8 as its clip is, got 7 x 8"):
         sample(image=ImageFile(tmp_path / "wrong.png", 6, 8)).read_image()
-    with pytest.raises(ValueError, match=r"tall\.png: must have the proportions of the picture, 6 x 8, got 6 x 4"):
+    with pytest.raises(ValueError, match=r"tall\.png: must have the proportions of the image, 6 x 8, got 6 x 4"):
         sample(labels=LabelFile(tmp_path / "tall.png", "trainIds")).read_labels()
     with pytest.raises(ValueError, match=r"no\.png: No such file"):
         sample(image=ImageFile(tmp_path / "no.png", 6, 8)).read_image()
@@ -120,7 +120,7 @@ def test_refuses(arguments: dict[str, np.ndarray], message: str) -> None:
         Sample.from_arrays(**({"name": "0", "image": np.zeros((3, 6, 8)), "K": K} | arguments))
 
 
-def test_what_is_not_there_is_told() -> None:
+def test_what_is_not_there_is_reported() -> None:
     bare = sample(depth=None, labels=None)
     for read, what in ((bare.read_depth, "depth"), (bare.read_labels, "labels"), (bare.read_mask, "labels")):
         with pytest.raises(ValueError, match=f"sample 000007 has no {what}"):

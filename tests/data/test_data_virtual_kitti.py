@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_files import pose, row, write_pictures, write_text
+from data_files import pose, row, write_images, write_text
 
 from vestcl import io
 from vestcl.data.readers.virtual_kitti import open_virtual_kitti
@@ -27,7 +27,7 @@ def tree(tmp_path: Path, variant: str = "clone") -> Path:
     write_text(folder / "intrinsic.txt", *intrinsic)
     frames = folder / "frames"
     for camera in ("Camera_0", "Camera_1"):
-        write_pictures(frames / "rgb" / camera, [f"rgb_{i:05}.jpg" for i in range(3)], *SIZE)
+        write_images(frames / "rgb" / camera, [f"rgb_{i:05}.jpg" for i in range(3)], *SIZE)
     for i in range(3):
         io.write_pixels(frames / "depth" / "Camera_0" / f"depth_{i:05}.png", np.full(SIZE, 150 + i, np.uint16))
         classes = np.full((*SIZE, 3), (90, 200, 255), np.uint8)
@@ -93,7 +93,7 @@ def test_bad_files_are_named(tmp_path: Path, file: str, content: str | None, mes
         open_virtual_kitti(folder)
 
 
-def test_no_pictures(tmp_path: Path) -> None:
+def test_no_images(tmp_path: Path) -> None:
     (tmp_path / "clone" / "frames" / "rgb").mkdir(parents=True)
     with pytest.raises(ValueError, match=r"has no frames/rgb/Camera_0/rgb_\*\.jpg"):
         open_virtual_kitti(tmp_path / "clone")

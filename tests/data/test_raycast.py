@@ -35,7 +35,7 @@ def rays() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_box_by_hand(session: opencl.Session) -> None:
-    """A box 2 m wide and high, its front 9 m ahead; beside it the road at z = h f / (v - cy), above it the sky."""
+    """A box 2 m wide and high, its front 9 m ahead; next to it the road at z = h f / (v - cy), above it the sky."""
     frame = look(plain(Shape.BOX, (0.0, -1.0, 10.0), (1.0, 1.0, 1.0)))
     x, y = rays()
     front = (np.abs(x) < 1 / 9) & (y < EYE / 9) & (y > (EYE - 2) / 9)
@@ -64,18 +64,18 @@ def test_tapered_box_by_hand(session: opencl.Session) -> None:
 
 @pytest.mark.parametrize("shape", [Shape.ELLIPSOID, Shape.CYLINDER])
 def test_round_solids_by_hand(session: opencl.Session, shape: Shape) -> None:
-    """A ball of radius 1 m at the eye's height, or a post of it on the road and beyond the picture, 10 m ahead."""
+    """A ball of radius 1 m at the eye's height, or a post of it on the road and beyond the image, 10 m ahead."""
     ball = shape == Shape.ELLIPSOID
     frame = look(plain(shape, (0.0, -EYE if ball else -25.0, 10.0), (1.0, 1.0 if ball else 25.0, 1.0)))
     x, y = rays()
     across = x**2 + (y**2 if ball else 0)
-    room = 100 - 99 * (1 + across)  # of s^2 (1 + across) - 20 s + 99 = 0
-    s = (10 - np.sqrt(np.maximum(room, 0))) / (1 + across)
-    hit = (room > 0.1) & (s * y < EYE - 0.01)
+    discriminant = 100 - 99 * (1 + across)  # of s^2 (1 + across) - 20 s + 99 = 0
+    s = (10 - np.sqrt(np.maximum(discriminant, 0))) / (1 + across)
+    hit = (discriminant > 0.1) & (s * y < EYE - 0.01)
     assert hit.sum() > 30
     np.testing.assert_allclose(frame.depth[0, 0][hit], s[hit], rtol=1e-4)
     assert np.all(frame.labels[0, 0][hit] == Label.POLE)
-    assert not np.any(frame.labels[0, 0][room < -0.1] == Label.POLE)
+    assert not np.any(frame.labels[0, 0][discriminant < -0.1] == Label.POLE)
 
 
 def test_a_turned_box_is_the_box_turned(session: opencl.Session) -> None:

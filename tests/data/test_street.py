@@ -1,4 +1,4 @@
-"""The procedural street: geometry by hand, the same picture for a seed, and depth that agrees between cameras."""
+"""The procedural street: geometry by hand, the same image for a seed, and depth that agrees between cameras."""
 
 from typing import Any
 
@@ -68,7 +68,7 @@ def test_sky_is_far_and_only_sky_is(session: opencl.Session) -> None:
     assert frame.depth.min() > 0.1
 
 
-def test_a_camera_on_the_right_sees_things_further_left(session: opencl.Session) -> None:
+def test_a_camera_on_the_right_sees_objects_further_left(session: opencl.Session) -> None:
     """Points of the first camera, projected into the second, lie at the depth that is rendered there."""
     street, K = Street.generate(0), torch.from_numpy(intrinsics(HEIGHT, WIDTH)).float()[None]
     tgt_from_cam = shift(x=-0.5, z=-0.8)
@@ -101,9 +101,9 @@ def test_batches_are_single_frames(session: opencl.Session) -> None:
     poses = np.stack([np.linalg.inv(street.camera_pose(t)) for t in (0.0, 0.5)])
     both = look(street, camera_from_world=poses, t=np.array([0.0, 0.5]))
     for i, t in enumerate((0.0, 0.5)):
-        alone = look(street, camera_from_world=poses[i], t=t)
-        assert np.array_equal(both.colour[i], alone.colour[0])
-        assert np.array_equal(both.depth[i], alone.depth[0])
+        single = look(street, camera_from_world=poses[i], t=t)
+        assert np.array_equal(both.colour[i], single.colour[0])
+        assert np.array_equal(both.depth[i], single.depth[0])
 
 
 def film_curve(light: np.ndarray) -> np.ndarray:
@@ -121,7 +121,7 @@ def light_of(colour: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("samples", [2, 3])
 def test_samples_are_averaged_in_linear_light(session: opencl.Session, samples: int) -> None:
-    """A picture ``samples`` times as large has one pixel for each ray."""
+    """An image ``samples`` times as large has one pixel for each ray."""
     street, size = Street.generate(1), (24, 80)
     small = look(street, K=intrinsics(*size), height=size[0], width=size[1], samples=samples)
     large = look(

@@ -1,4 +1,4 @@
-"""A street as a clip: the pictures that it renders, once each, and those who read clips reading it."""
+"""A street as a clip: the images that it renders, once each, and those who read clips reading it."""
 
 import pickle
 from collections.abc import Iterator
@@ -45,7 +45,7 @@ def test_frames_are_the_streets(session: opencl.Session) -> None:
         assert np.array_equal(sample.right.K, sample.K)
 
 
-def test_every_picture_is_rendered_once(session: opencl.Session) -> None:
+def test_every_image_is_rendered_once(session: opencl.Session) -> None:
     clip = street_clip(Street.generate(0), 2, HEIGHT, WIDTH)
     rendered = clip_module._rendered.cache_info
     assert rendered().misses == 0

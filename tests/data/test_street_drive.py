@@ -17,7 +17,7 @@ FPS = 10.0
 
 
 def recorded(yaw: Any = 0.0, pitch: Any = 0.0, y: Any = 0.0, speed: Any = 8.0, frames: int = 200) -> np.ndarray:
-    """[N, 4, 4] of a car that drives where it looks; every number is one or one a frame."""
+    """[N, 4, 4] of a car that drives where it looks; every number is one or one per frame."""
     yaw, pitch, y, speed = (np.broadcast_to(np.asarray(value, float), frames) for value in (yaw, pitch, y, speed))
     steps = np.stack([np.sin(yaw), np.cos(yaw)], axis=1) * speed[:, None] / FPS
     x, z = (np.cumsum(steps, axis=0) - steps).T
@@ -105,7 +105,7 @@ def test_speed_is_followed_and_never_negative() -> None:
     np.testing.assert_allclose(steps, np.maximum(speed[:-1], 0) / FPS, atol=1e-9)
 
 
-def test_a_recording_goes_on_beyond_its_end() -> None:
+def test_a_recording_continues_beyond_its_end() -> None:
     """Backwards, then forwards: what wobbles repeats, what is driven adds up, nothing jumps."""
     drive = Recording.from_trajectory(recorded(pitch=sine(0.01, 0.9, 50), speed=np.linspace(3, 9, 50), frames=50))
     t = np.arange(-12, 25, 0.01)
@@ -180,7 +180,7 @@ def test_drawn_driving_is_forwards_varied_and_in_its_lane() -> None:
     steps = np.diff(numbers[..., 0], axis=1)
     assert steps.min() >= 0
     assert np.ptp([drive.speed for drive in drives]) > 8
-    assert np.abs(numbers[..., 1]).max() < 0.6  # the room beside a car
+    assert np.abs(numbers[..., 1]).max() < 0.6  # the room next to a car
     rates = np.degrees(np.diff(numbers[..., 3], axis=1)).std(axis=1)
     assert rates.max() > 4 * rates.min()
 

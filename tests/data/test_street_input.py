@@ -48,7 +48,7 @@ def test_names() -> None:
     [
         ("street:7?drive=fast", "drive must be usual, random, road, got 'fast'"),
         ("street:7?speed=3", "must have options of drive, fps, depth and masks"),
-        ("street:7?fps=0", "fps must be 0.1 ... 240 frames a second or random, got '0'"),
+        ("street:7?fps=0", "fps must be 0.1 ... 240 frames per second or random, got '0'"),
         ("street:7?fps=nan", "fps must be"),
         ("street:7?fps=8,fps=9", "has fps twice"),
         ("street:7?", "must have options"),
@@ -70,7 +70,7 @@ def test_draws_are_by_seed_and_in_range() -> None:
     assert drawn[0].drawn(0) == drawn[0]
 
 
-def test_the_usual_street_stays_as_it_is() -> None:
+def test_the_default_street_stays_as_it_is() -> None:
     """Its frames have the same keys, whatever it is called by."""
     plain = street_clip(Street.generate(5), 3, *SIZE, samples=1)
     for text in ("street:5", "street:5?drive=usual", "street:5?depth=true,masks=true,fps=10"):

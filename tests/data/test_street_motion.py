@@ -1,4 +1,4 @@
-"""`Street.motion`: by hand for what stands, drives and walks, and against what is rendered one step later."""
+"""`Street.motion`: by hand for what is static, drives and walks, and against what is rendered one step later."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ def apply(dst_from_src: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", [0, 3])
-def test_what_stands_moves_rigidly(session: opencl.Session, seed: int) -> None:
+def test_what_is_static_moves_rigidly(session: opencl.Session, seed: int) -> None:
     street = Street.generate(seed)
     frame, displacement = look(street, 1.0), move(street, 1.0, 1.0 + STEP)
     assert displacement.shape == (3, HEIGHT, WIDTH)
@@ -70,7 +70,7 @@ def test_the_sky_only_turns(session: opencl.Session) -> None:
 
 
 def test_cars_and_people_by_hand(session: opencl.Session) -> None:
-    """A camera that stands still and looks along the road sees only u_z, each file's own speed."""
+    """A static camera that looks along the road sees only u_z, each file's own speed."""
     street = Street.generate(0)
     level = np.eye(4)
     level[:3, 3] = -1.6, 1.65, 0.0

@@ -132,7 +132,7 @@ def test_the_profile_has_the_roughness_of_the_standard(monkeypatch: pytest.Monke
         assert power[band].sum() * n[1] == pytest.approx(16e-6 * 0.01 * (1 / low - 1 / high), rel=0.25)
 
 
-# ---------------------------------------------------------------- what stands and moves along it
+# ---------------------------------------------------------------- static and dynamic objects along it
 
 
 def test_a_bent_street_has_the_same_parts() -> None:
@@ -216,6 +216,6 @@ def test_textures_stay_on_the_road(session: opencl.Session) -> None:
     assert np.abs(one - other).mean() < 0.2 * one.std()
 
 
-def test_the_usual_drive_is_straight() -> None:
+def test_the_default_drive_is_straight() -> None:
     assert isinstance(Street.generate(7).drive, Sway)
     assert road(7).drive == road(7).drive != road(8).drive

@@ -1,4 +1,4 @@
-"""Forecasts whose scores are known: the truth itself, and a street that stands still."""
+"""Forecasts whose scores are known: the truth itself, and a static street."""
 
 from dataclasses import replace
 
@@ -75,7 +75,7 @@ def test_scores_are_taken_at_the_size_asked_for() -> None:
     assert comparison.images[FORECAST][0].shape == comparison.truth[0].shape == (3, HEIGHT, WIDTH)
 
 
-def test_a_street_that_stands_still_is_repeated() -> None:
+def test_a_static_street_is_repeated() -> None:
     clip = make_clip(still=True)
     views = parse_views(["source"], clip)
     (comparison,) = compare(make_forecast(views, [noise(9)]), clip, 2, views)
@@ -138,7 +138,7 @@ def test_sheet_has_a_row_a_step_and_a_black_error_where_all_is_right() -> None:
     assert titled.shape[0] == picture.shape[0] + line
 
 
-def test_mistakes_are_told() -> None:
+def test_mistakes_are_reported() -> None:
     clip = make_clip()
     views = parse_views(["source", "0,0,1"], clip)
     forecast = make_forecast(views, [noise(2)])
@@ -151,5 +151,5 @@ def test_mistakes_are_told() -> None:
         compare(forecast, clip, 1, views[1:])
     lonely = replace(clip, samples=(*clip.samples[:3], replace(clip[3], right=None)))
     right = parse_views(["right"], clip)
-    with pytest.raises(ValueError, match="clip: frame 0003 has no picture from right"):
+    with pytest.raises(ValueError, match="clip: frame 0003 has no image from right"):
         compare(make_forecast(right, [noise(2), noise(3)]), lonely, 1, right)

@@ -141,7 +141,7 @@ def test_masked_is_cropped(metric: Any) -> None:
     torch.testing.assert_close(metric(target + 0.1, target, everything), metric(target + 0.1, target))
 
 
-def test_nothing_visible_is_nan_for_that_image_alone() -> None:
+def test_nothing_visible_is_nan_for_that_image_only() -> None:
     prediction, target = image_pair()
     mask = torch.ones(2, 1, 40, 50)
     mask[1] = 0

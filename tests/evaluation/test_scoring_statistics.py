@@ -35,8 +35,8 @@ def test_intervals_are_those_of_the_normal_distribution() -> None:
 
 def test_windows_of_one_clip_are_drawn_by_themselves() -> None:
     values = np.arange(20.0)[:, None]
-    (alone,), (apart,) = bootstrap(values, ["one"] * 20), bootstrap(values, [f"{i:02}" for i in range(20)])
-    assert alone == apart
+    (single,), (apart,) = bootstrap(values, ["one"] * 20), bootstrap(values, [f"{i:02}" for i in range(20)])
+    assert single == apart
     assert unit([record("one", 1), record("one", 2)]) == "windows"
     assert unit([record("one", 1), record("two", 1)]) == "clips"
 

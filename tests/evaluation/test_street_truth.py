@@ -100,7 +100,7 @@ def test_ego_errors_by_hand() -> None:
     assert np.isnan(errors["translation_percent"][1]) and errors["rotation_deg"] == [0.0, 0.0]
 
 
-def test_the_splatter_alone_is_close_to_warping() -> None:
+def test_the_splatter_is_close_to_warping() -> None:
     values = known.splatter_alone(clip_of_street(samples=2), 2)
     loss = values["warped_db"][0] - values["splatted_db"][0]
     assert values["splatter_loss_db"] == [pytest.approx(loss)]

@@ -41,7 +41,7 @@ def write_safetensors(path: Path, state: dict[str, torch.Tensor]) -> None:
 
 
 def public(trunk: Trunk) -> dict[str, torch.Tensor]:
-    """The trunk's weights as a public file has them, with a classifier's beside them."""
+    """The trunk's weights as a public file has them, with a classifier's next to them."""
     return {**trunk.state_dict(), "classifier.1.weight": torch.zeros(3, 3), "features.99.bias": torch.zeros(1)}
 
 

@@ -129,7 +129,7 @@ def test_ply_refuses_what_it_cannot_write(tmp_path: Path) -> None:
         ({"views": []}, "`views` must be one camera or more, got none"),
         ({"views": ["above"]}, "above"),
         ({"views": [View("source", np.eye(4)), "source"]}, "`views` must have a name of their own"),
-        ({"model": "vest-xl"}, "vest-xl: is no model"),
+        ({"model": "vest-xl"}, "vest-xl: is not a model"),
     ],
 )
 def test_mistakes(clip: vestcl.Clip, changes: dict[str, Any], message: str) -> None:
@@ -188,7 +188,9 @@ def test_a_repository(model: vestcl.Forecaster, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(forecaster, "hf_hub_download", download)
     assert same(vestcl.Forecaster.from_pretrained("someone/net", revision="v1"), model)
     assert asked == [("someone/net", "model.safetensors", "v1")]
-    with pytest.raises(ValueError, match="someone/else: is no file here, and can't be had from the hub: 404 Not Found"):
+    with pytest.raises(
+        ValueError, match="someone/else: is not a file here, and can't be had from the hub: 404 Not Found"
+    ):
         vestcl.Forecaster.from_pretrained("someone/else")
 
 

@@ -23,7 +23,7 @@ Points = tuple[torch.Tensor, torch.Tensor]
 
 @pytest.fixture
 def texture() -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
-    """A picture [1, 3, H, W] that is known at every real x, y: forty waves of 8 to 40 px for each channel."""
+    """An image [1, 3, H, W] that is known at every real x, y: forty waves of 8 to 40 px for each channel."""
     angle, phase = 2 * math.pi * torch.rand(2, 3, 40, 1, 1)
     wavelength = 8 + 32 * torch.rand(3, 40, 1, 1)
 
@@ -40,7 +40,7 @@ def pixel_centres() -> Points:
 
 
 def psnr_by_step(frames: torch.Tensor, truth: torch.Tensor, border: int = 12) -> torch.Tensor:
-    """dB at each step, away from the border, where new things come in that nobody can know."""
+    """dB at each step, away from the border, where new objects come in that nobody can know."""
     return metrics.psnr(*(images[..., border:-border, border:-border] for images in (frames[0], truth)))
 
 
@@ -109,8 +109,8 @@ def test_batch_and_order_do_not_matter(texture: Any) -> None:
     x, y = pixel_centres()
     frame_prev, frame_cur = (torch.cat([texture(x - t, y), texture(x, y - 2 * t)]) for t in (0, 1))
     both = flow_extrapolation(frame_prev, frame_cur, 2)
-    alone = flow_extrapolation(frame_prev[1:], frame_cur[1:], 2)
-    assert torch.equal(both[1:], alone)
+    single = flow_extrapolation(frame_prev[1:], frame_cur[1:], 2)
+    assert torch.equal(both[1:], single)
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def make_clip(frames: int = 3, fps: float | None = 20.0) -> Clip:
 
 
 def make_forecast(views: list[View], steps: int = 2) -> Forecast:
-    """Noise, another in every picture; colours of 8 bits, which PNG keeps."""
+    """Noise, another in every image; colours of 8 bits, which PNG keeps."""
     rng = np.random.default_rng(0)
 
     def rendered() -> Rendered:
@@ -83,7 +83,7 @@ def test_round_trip(tmp_path: Path) -> None:
         assert np.array_equal(np.asarray(picture), sheet)
 
 
-def test_what_a_network_skipped_is_told(tmp_path: Path) -> None:
+def test_what_a_network_skipped_is_reported(tmp_path: Path) -> None:
     clip = make_clip()
     views = parse_views(["source"], clip)
     skipped = {"seen": SkippedWork(1, 2, "frames", 0.25), "covered": SkippedWork(9000, 10_000, "points", None)}
@@ -95,21 +95,21 @@ def test_what_a_network_skipped_is_told(tmp_path: Path) -> None:
         "seen": {"skipped": 1, "of": 2, "unit": "frames", "saved_seconds": 0.25, "share": 0.5},
         "covered": {"skipped": 9000, "of": 10_000, "unit": "points", "saved_seconds": None, "share": 0.9},
     }
-    told = [str(SkippedWork(**{key: one[key] for key in SkippedWork._fields})) for one in about["skipped"].values()]
-    assert told == ["50 % of 2 frames, about 0.25 s", "90 % of 10,000 points"]
+    reported = [str(SkippedWork(**{key: one[key] for key in SkippedWork._fields})) for one in about["skipped"].values()]
+    assert reported == ["50 % of 2 frames, about 0.25 s", "90 % of 10,000 points"]
     write_forecast(tmp_path, make_forecast(views), clip, 1, views, Details(""))
     assert not {"profile", "skipped"} & set(read_forecast(tmp_path).about)
 
 
-def test_every_file_that_is_told_exists_and_no_other(tmp_path: Path) -> None:
+def test_every_file_that_is_listed_exists_and_no_other(tmp_path: Path) -> None:
     clip = make_clip()
     views = parse_views(["source", "right"], clip)
     write_forecast(tmp_path, make_forecast(views), clip, 1, views, Details(""), gif=True)
-    told = {"forecast.json"}
+    reported = {"forecast.json"}
     for view in read_forecast(tmp_path).about["views"].values():
-        told |= {view["video"], view["gif"], *(file for frame in view["frames"] for file in frame.values())}
+        reported |= {view["video"], view["gif"], *(file for frame in view["frames"] for file in frame.values())}
     there = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
-    assert there == told
+    assert there == reported
     assert len(there) == 1 + 2 * (1 + 1 + 4)
 
 
@@ -139,7 +139,7 @@ def test_videos_of_the_source_begin_with_the_past(tmp_path: Path) -> None:
             assert gif.info["duration"] == 50
 
 
-def test_ten_frames_a_second_where_the_clip_does_not_tell(tmp_path: Path) -> None:
+def test_ten_frames_per_second_where_the_clip_has_none(tmp_path: Path) -> None:
     clip = make_clip(fps=None)
     views = parse_views(["right"], clip)
     write_forecast(tmp_path, make_forecast(views), clip, 1, views, Details(""))
@@ -197,15 +197,15 @@ def test_report_rises_to_one(tmp_path: Path) -> None:
     assert shares == [0.5, 1]
 
 
-def test_machine_tells_what_is_in_use(session: opencl.Session) -> None:
-    told = machine()
-    assert told["versions"]["vestcl"] == __version__
-    assert all(told["versions"][name] for name in ("python", "numpy", "torch", "opencv", "pyopencl"))
-    assert told["device"]["name"] == session.info.name
-    assert told["device"]["driver"] == session.info.driver
+def test_machine_reports_what_is_in_use(session: opencl.Session) -> None:
+    reported = machine()
+    assert reported["versions"]["vestcl"] == __version__
+    assert all(reported["versions"][name] for name in ("python", "numpy", "torch", "opencv", "pyopencl"))
+    assert reported["device"]["name"] == session.info.name
+    assert reported["device"]["driver"] == session.info.driver
 
 
-def test_mistakes_are_told(tmp_path: Path) -> None:
+def test_mistakes_are_reported(tmp_path: Path) -> None:
     clip = make_clip()
     views = parse_views(["source", "right"], clip)
     forecast = make_forecast(views)
@@ -223,7 +223,7 @@ def test_mistakes_are_told(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_reading_mistakes_are_told(tmp_path: Path) -> None:
+def test_reading_mistakes_are_reported(tmp_path: Path) -> None:
     clip = make_clip()
     views = parse_views(["source"], clip)
     write_forecast(tmp_path, make_forecast(views), clip, 1, views, Details(""))
@@ -234,7 +234,7 @@ def test_reading_mistakes_are_told(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=rf"`step` must be 1 \.\.\. 2, got {step}"):
             saved.frame(step, "source")
     (tmp_path / "forecast.json").write_text("{")
-    with pytest.raises(ValueError, match=r"forecast\.json: is no JSON"):
+    with pytest.raises(ValueError, match=r"forecast\.json: is not JSON"):
         read_forecast(tmp_path)
     (tmp_path / "forecast.json").write_text('{"format": "vestcl forecast 0"}')
     with pytest.raises(ValueError, match="must have the format 'vestcl forecast 1'"):

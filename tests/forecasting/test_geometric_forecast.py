@@ -24,7 +24,7 @@ LEFT, RIGHT = View("left", np.eye(4)), View("right", pose(xyz=(-0.54, 0, 0)))
 #: The current frame, and how many are forecast.
 NOW, STEPS = 3, 3
 
-#: A plain drive, and one past an oncoming car that fills a tenth of the picture: seed and start, seconds.
+#: A plain drive, and one past an oncoming car that fills a tenth of the image: seed and start, seconds.
 PLAIN, PASSING = (4, 0.0), (0, 1.3)
 
 
@@ -100,7 +100,7 @@ def test_a_moving_car_drives_on() -> None:
 
 
 @pytest.mark.parametrize("scene", [PLAIN, PASSING])
-def test_motion_of_what_stands(scene: tuple[int, float]) -> None:
+def test_motion_of_what_is_static(scene: tuple[int, float]) -> None:
     """To 5 cm of about 0.9 m at t+1, with the true cameras."""
     street, frame = drive(scene[0], start=scene[1], samples=2), forecast(*scene, True).frames[0]["left"]
     truth, still = -street.cur_to_next(NOW + 1, NOW), ~street.moving(NOW + 1) & (frame.depth[0] > 0)
@@ -182,12 +182,12 @@ def test_the_right_view_is_what_the_right_camera_sees() -> None:
 
 
 def test_a_view_with_a_camera_of_its_own() -> None:
-    """The principal point 12 px further right moves the picture as far."""
+    """The principal point 12 px further right moves the image as far."""
     K = intrinsics(HEIGHT, WIDTH)
     K[0, 2] += 12
     shifted = forecast_frames(perception(*PLAIN), NOW, 1, [View("shifted", np.eye(4), K)]).frames[0]["shifted"]
     plain = forecast(*PLAIN).frames[0]["left"]
-    seen = plain.coverage[0, :, 2:-14] > 0.5  # what fills the holes depends on all of the picture
+    seen = plain.coverage[0, :, 2:-14] > 0.5  # what fills the holes depends on all of the image
     off = np.abs(shifted.image[:, :, 14:-2] - plain.image[:, :, 2:-14])[:, seen]
     assert np.quantile(off, 0.99) < 1e-3
     np.testing.assert_allclose(shifted.coverage[:, :, 14:-2], plain.coverage[:, :, 2:-14], atol=1e-2)
@@ -212,7 +212,7 @@ def test_what_a_forecast_holds() -> None:
 
 @dataclass(frozen=True)
 class Unread:
-    """A picture that no one may look at."""
+    """An image that no one may look at."""
 
     height: int = HEIGHT
     width: int = WIDTH
@@ -222,7 +222,7 @@ class Unread:
 
 
 def test_the_future_is_never_looked_at() -> None:
-    """Pictures that raise when read, and poses of another drive."""
+    """Images that raise when read, and poses of another drive."""
     clip = perception(*PLAIN).clip
     nowhere = pose(1.0, (5, 5, 5))
     blind: dict[str, Any] = {name: Unread() for name in ("image", "depth", "labels")}
@@ -254,9 +254,9 @@ def test_from_the_second_frame_on() -> None:
 
 
 def test_progress() -> None:
-    told: list[tuple[str, float]] = []
-    forecast_clip(perception(*PLAIN).clip, NOW, 2, [LEFT, RIGHT], progress=lambda *stage: told.append(stage))
-    stages, shares = zip(*told, strict=True)
+    reported: list[tuple[str, float]] = []
+    forecast_clip(perception(*PLAIN).clip, NOW, 2, [LEFT, RIGHT], progress=lambda *stage: reported.append(stage))
+    stages, shares = zip(*reported, strict=True)
     assert stages[-4:] == ("render",) * 4 and "layers" in stages[:-4]
     assert list(shares) == sorted(shares) and shares[0] == 0 and 0.8 < shares[-1] <= 1
 
@@ -304,7 +304,7 @@ def test_frames_without_depth_between_others(without: tuple[int, ...]) -> None:
 
 
 def test_the_backtest_is_a_stage_and_done_once() -> None:
-    """Two forecasts of a frame share it; the frame itself, shown from beside, needs none."""
+    """Two forecasts of a frame share it; the frame itself, shown from the side, needs none."""
     clip = drive(PLAIN[0], start=PLAIN[1], samples=1).clip
     shown = Perception(clip)
     show_frame(shown, NOW, [RIGHT])

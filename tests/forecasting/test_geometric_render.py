@@ -26,7 +26,7 @@ def seen(*clouds: FrameCloud, tgt_from_next: Matrix = EYE) -> Shown:
 # ---------------------------------------------------------------- one cloud
 
 
-def test_at_rest_the_picture_stays() -> None:
+def test_at_rest_the_image_stays() -> None:
     image, depth = noise(), room()
     shown = seen(cloud_of(image, depth))
     assert shown.planes.shape == (7, HEIGHT, WIDTH) and shown.planes.dtype == np.float32
@@ -37,7 +37,7 @@ def test_at_rest_the_picture_stays() -> None:
 
 
 def test_no_cracks_in_a_wall_that_comes_nearer() -> None:
-    """Zoomed by 1.3, a wall stays covered, and looks as the picture warped backwards."""
+    """Zoomed by 1.3, a wall stays covered, and looks as the image warped backwards."""
     image, zoom = noise(blur=2.0), 1.3
     ahead = pose(xyz=(0, 0, 10 / zoom - 10))
     shown = seen(cloud_of(image, flat(10)), tgt_from_next=ahead)
@@ -64,7 +64,7 @@ def test_inverse_depth_and_motion() -> None:
     np.testing.assert_allclose(shown.planes[4:], np.broadcast_to(planes(0.5, -0.25, -2), (3, HEIGHT, WIDTH)), atol=1e-5)
 
 
-def test_a_camera_to_the_right_sees_things_further_left() -> None:
+def test_a_camera_to_the_right_sees_objects_further_left() -> None:
     """By f t / z = 190 x 0.5 / 9.5 = 10 px."""
     image = noise()
     shown = seen(cloud_of(image, flat(9.5)), tgt_from_next=pose(xyz=(-0.5, 0, 0)))
@@ -73,7 +73,7 @@ def test_a_camera_to_the_right_sees_things_further_left() -> None:
 
 
 @pytest.mark.parametrize("tgt_from_next", [pose(xyz=(0, 0, -20)), pose(xyz=(100, 0, 0))])
-def test_what_is_behind_or_beside_the_camera_is_not_seen(tgt_from_next: Matrix) -> None:
+def test_what_is_behind_or_next_to_the_camera_is_not_seen(tgt_from_next: Matrix) -> None:
     shown = seen(cloud_of(noise(), flat(10)), tgt_from_next=tgt_from_next)
     assert not shown.planes.any() and not shown.coverage.any() and holes(shown).all()
 
@@ -117,7 +117,7 @@ def test_a_cloud_of_no_points_changes_nothing() -> None:
     assert not seen(none).coverage.any() and not seen().planes.any()
 
 
-# ---------------------------------------------------------------- spray and thin things
+# ---------------------------------------------------------------- spray and thin objects
 
 
 def edge_with_spray() -> tuple[Floats, Floats]:

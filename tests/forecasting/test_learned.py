@@ -145,7 +145,7 @@ def test_all_tests_count(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("ahead", [1, 2])
 def test_the_test_by_hand(ahead: int) -> None:
-    """A wall 8 m away that moves 3 px an interval with the camera, at a pixel each: right at the true motion only."""
+    """A wall 8 m away that moves 3 px per interval with the camera, at a pixel each: right at the true motion only."""
     rng = np.random.default_rng(0)
     strip = cv2.GaussianBlur(rng.random((40, 200), np.float32), (0, 0), 2.0)
     image, prev = (np.stack([strip[:, at : at + 80]] * 3) for at in (3 * ahead, 0))
@@ -286,8 +286,8 @@ def test_what_was_seen_before_changes_nothing() -> None:
     for index in (3, 4):
         network.forecast_frames(before, noisy, index, 1, VIEWS)
     again = network.forecast_frames(before, noisy, 5, 1, VIEWS)
-    alone = network.forecast_frames(Perception(clip()), stir_all(model(camera=0.3)), 5, 1, VIEWS)
-    assert again.learned == alone.learned
+    single = network.forecast_frames(Perception(clip()), stir_all(model(camera=0.3)), 5, 1, VIEWS)
+    assert again.learned == single.learned
 
 
 @pytest.mark.parametrize("index", [1, 2])

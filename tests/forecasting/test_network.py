@@ -96,7 +96,7 @@ def test_recursion_sees_what_it_is_given() -> None:
 @pytest.mark.parametrize("mode", ["compose", "feedback"])
 @pytest.mark.parametrize("start", ["prior", "rest"])
 def test_it_is_the_models_own_forecast(start: str, mode: Any) -> None:
-    """On what was measured of frames t - 1 and t; a model that starts from rest is told no prior."""
+    """On what was measured of frames t - 1 and t; a model that starts from rest is given no prior."""
     network = model(start)
     result = forecast_frames(perception(), network, 2, 2, VIEWS, mode=mode, learned="all")
     prev, cur = (perception().seen(index) for index in (1, 2))
@@ -127,7 +127,7 @@ def test_it_is_the_models_own_forecast(start: str, mode: Any) -> None:
     assert result.method == network.config.name and result.seconds["network"] > 0
 
 
-def test_a_forecast_tells_its_stages_and_what_it_skipped() -> None:
+def test_a_forecast_reports_its_stages_and_what_it_skipped() -> None:
     """Of this forecast alone; the model is as it was."""
     network = model()
     views = [*VIEWS, View("again", np.eye(4))]
@@ -180,15 +180,17 @@ def test_a_view_may_have_a_camera_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("learned", ["tested", "all"])
-def test_a_clip_is_perceived_and_told_of(learned: Any) -> None:
+def test_a_clip_is_perceived_and_reported(learned: Any) -> None:
     """Stages are reported with shares that grow to nearly 1; no later frame is looked at."""
-    told: list[tuple[str, float]] = []
-    how: dict[str, Any] = {"learned": learned, "progress": lambda stage, share: told.append((stage, share))}
+    reported: list[tuple[str, float]] = []
+    how: dict[str, Any] = {"learned": learned, "progress": lambda stage, share: reported.append((stage, share))}
     result = forecast_clip(clip(), 2, 1, VIEWS, model(), **how)
     assert_same(result, forecast_frames(perception(), model(), 2, 1, VIEWS, learned=learned))
-    shares = [share for _, share in told]
+    shares = [share for _, share in reported]
     assert shares == sorted(shares) and shares[0] == 0 and 0.8 < shares[-1] <= 1
-    assert told[-1][0] == ("network" if learned == "all" else "render") and len({stage for stage, _ in told}) > 3
+    assert (
+        reported[-1][0] == ("network" if learned == "all" else "render") and len({stage for stage, _ in reported}) > 3
+    )
     short = forecast_clip(clip()[:3], 2, 1, VIEWS, model(), learned=learned)
     assert_same(short, result)
 

@@ -85,7 +85,7 @@ def test_input_has_memory_of_its_own() -> None:
     assert np.array_equal(cur.velocity, kept) and cur.layers.image.any()
 
 
-def test_the_last_two_motions_are_told() -> None:
+def test_the_last_two_motions_are_given() -> None:
     prev, cur = prepared(0, MOTIONS[0]), prepared(1, MOTIONS[1])
     prior = network_input(prev, cur, last_motions(prev, cur)).prior
     from_cur, last, before = (geometry.compose_rigid(*rigid)[0].double().numpy() for rigid in prior[:3])

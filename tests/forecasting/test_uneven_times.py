@@ -101,7 +101,7 @@ def test_objects_move_by_time() -> None:
 
 @pytest.mark.parametrize("gap", [3.0, 7.0])
 def test_a_gap_that_is_too_long_to_match(gap: float) -> None:
-    """The camera goes on as before the gap, where flow across it is lost; a line says so."""
+    """The camera continues as before the gap, where flow across it is lost; a line says so."""
     street = Street.generate(4)
     seconds = [0.0, 0.1, 0.2, 0.2 + gap / 10, 0.3 + gap / 10]
     clips = [street_clip(street, 1, HEIGHT, WIDTH, start=second)[0] for second in seconds]
@@ -242,7 +242,7 @@ def test_a_video_of_variable_frame_rate(tmp_path: Path, capsys: pytest.CaptureFi
     pixels = [street()[i] for i in kept]
     video = write_video(tmp_path / "a.mkv", pixels, [i / 10 for i in kept], options={"crf": "10"})
     out = tmp_path / "out"
-    told = [
+    arguments = [
         "forecast",
         str(video),
         "--fov",
@@ -256,7 +256,7 @@ def test_a_video_of_variable_frame_rate(tmp_path: Path, capsys: pytest.CaptureFi
         "--out",
         str(out),
     ]
-    assert cli.main(told) == 0
+    assert cli.main(arguments) == 0
     about = read_forecast(out).about
     scores = about["scores"]["source"]
     for mine, repeated in zip(scores["forecast"], scores["repeat last"], strict=True):
@@ -265,5 +265,5 @@ def test_a_video_of_variable_frame_rate(tmp_path: Path, capsys: pytest.CaptureFi
     (note,) = about["notes"]
     assert note.startswith("frames 000007 and 000008 are 0.7 s apart")
     assert f"note: {note}" in capsys.readouterr().out
-    assert cli.main([*told, "--frame", "7"]) == 2
+    assert cli.main([*arguments, "--frame", "7"]) == 2
     assert "after 7 there is none for 7" in capsys.readouterr().err

@@ -82,7 +82,7 @@ def test_turns(turn: str, tgt_from_next: list[list[float]], mono: Sample) -> Non
     assert np.allclose(parse_view(f"0,0,0,{turn}", mono).tgt_from_next, rigid(tgt_from_next), atol=1e-15)
 
 
-def test_a_turned_camera_stands_where_it_was_put(mono: Sample) -> None:
+def test_a_turned_camera_is_where_it_was_put(mono: Sample) -> None:
     view = parse_view("0.5,1,2,roll=90,yaw=90,name=odd_corner", mono)
     assert view.name == "odd_corner"
     assert np.allclose(view.tgt_from_next @ [0.5, 1, 2, 1], [0, 0, 0, 1])
@@ -107,11 +107,11 @@ def test_still_camera_has_a_name(mono: Sample) -> None:
         ("above", "`view` must be \"source\", .*, got 'above'"),
         ("", "got ''"),
         ("1,2", "got '1,2'"),
-        ("1,2,up", "'up' is no finite number"),
-        ("1,2,nan", "'nan' is no finite number"),
+        ("1,2,up", "'up' is not a finite number"),
+        ("1,2,nan", "'nan' is not a finite number"),
         ("1,2,3,4", "may have yaw=, pitch=, roll=, fov=, name=, each once, got '4'"),
         ("1,2,3,yaw=", "got 'yaw='"),
-        ("1,2,3,yaw=a", "'a' is no finite number"),
+        ("1,2,3,yaw=a", "'a' is not a finite number"),
         ("1,2,3,yaw=1,yaw=2", "each once, got 'yaw=2'"),
         ("1,2,3,spin=1", "got 'spin=1'"),
         ("1,2,3,fov=180", "`fov` must be between 0 and 180 degrees, got 180"),
@@ -120,7 +120,7 @@ def test_still_camera_has_a_name(mono: Sample) -> None:
         ("1,2,3,name=", "got 'name='"),
     ],
 )
-def test_mistakes_are_told(text: str, message: str, mono: Sample) -> None:
+def test_mistakes_are_reported(text: str, message: str, mono: Sample) -> None:
     with pytest.raises(ValueError, match=message):
         parse_view(text, mono)
 
@@ -132,7 +132,7 @@ def test_views_need_names_of_their_own(stereo: Sample) -> None:
         parse_views(["right", "source", "right"], stereo)
 
 
-def test_whose_pictures_are_a_views_truth(stereo: Sample) -> None:
+def test_whose_images_are_a_views_truth(stereo: Sample) -> None:
     assert seen_by(parse_view("source", stereo), stereo) is stereo
     assert seen_by(parse_view("0,0,0", stereo), stereo) is stereo
     assert seen_by(parse_view("0,0,0,fov=50", stereo), stereo) is None

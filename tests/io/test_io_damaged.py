@@ -134,12 +134,12 @@ def test_files_that_are_too_long(tmp_path: Path) -> None:
         (
             "rgb.png",
             png(1_000_000, 1_000_000),
-            "must have 1 to 65536 pixels a side and at most 67108864 in all, got 1000",
+            "must have 1 to 65536 pixels per side and at most 67108864 in all, got 1000",
         ),
-        ("rgb.png", png(1 << 31, 1), "must have 1 to 65536 pixels a side"),
+        ("rgb.png", png(1 << 31, 1), "must have 1 to 65536 pixels per side"),
         ("rgb.png", png(60_000, 60_000, zlib.compress(bytes(1000))), "at most 67108864 in all, got 60000 x 60000"),
-        ("rgb.png", png(0, 30), "must have 1 to 65536 pixels a side"),
-        ("rgb.png", png(8000, 8000, zlib.compress(bytes(1000))), "is no image, or a damaged one"),
+        ("rgb.png", png(0, 30), "must have 1 to 65536 pixels per side"),
+        ("rgb.png", png(8000, 8000, zlib.compress(bytes(1000))), "is not an image, or a damaged one"),
         ("depth.png", png(60_000, 60_000, kind=0), "at most 67108864 in all"),
         ("labels.png", png(60_000, 60_000, kind=0), "at most 67108864 in all"),
         ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000)}"), "at most 67108864"),
@@ -147,11 +147,11 @@ def test_files_that_are_too_long(tmp_path: Path) -> None:
         ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (-3, -4)}", bytes(48)), "a side"),
         ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (8000, 8000)}", bytes(64)), "damaged"),
         ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (2, 2)}", bytes(17)), "damaged"),
-        ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (0, 2)}"), "1 to 65536 pixels a side"),
+        ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (0, 2)}"), "1 to 65536 pixels per side"),
         ("depth.npy", npy("{'descr': '|V99999999', 'fortran_order': False, 'shape': (2, 2)}"), "array of numbers"),
-        ("depth.npy", npy("(" * 90), "is no NPY array"),
-        ("depth.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 1 << 31), "is no NPY array"),
-        ("depth.npy", b"\x93NUMPY\x07\x00" + bytes(100), "is no NPY array"),
+        ("depth.npy", npy("(" * 90), "is not an NPY array"),
+        ("depth.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 1 << 31), "is not an NPY array"),
+        ("depth.npy", b"\x93NUMPY\x07\x00" + bytes(100), "is not an NPY array"),
     ],
 )
 def test_headers_that_claim_too_much(tmp_path: Path, name: str, content: bytes, message: str) -> None:
@@ -173,7 +173,7 @@ def test_jpeg_headers(tmp_path: Path) -> None:
     scan = whole.index(b"\xff\xda")
     path.write_bytes(whole[:scan] + 101 * whole[scan:-2] + whole[-2:])
     (said,) = refusals(path, [io.read_pixels])
-    assert said.endswith("is no image, or a damaged one")
+    assert said.endswith("is not an image, or a damaged one")
 
 
 def test_exr_headers(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -185,7 +185,7 @@ def test_exr_headers(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
         ((0, 0, 2**31 - 1, 2**31 - 1), "a side"),
         ((-(2**31), 0, 2**31 - 1, 0), "a side"),
         ((9, 9, 0, 0), "a side"),
-        ((0, 0, 8000, 8000), "is no OpenEXR image, or a damaged one"),
+        ((0, 0, 8000, 8000), "is not an OpenEXR image, or a damaged one"),
     ]:
         path.write_bytes(whole[:at] + struct.pack("<4i", *window) + whole[at + 16 :])
         assert all(message in text for text in refusals(path, READERS["depth.exr"]))
@@ -214,7 +214,7 @@ def test_bytes_after_the_end_are_allowed(tmp_path: Path) -> None:
     (tmp_path / "rgb.jpg").write_bytes(with_thumbnail)
     assert io.read_pixels(tmp_path / "rgb.jpg").shape == (20, 30, 3)
     (tmp_path / "rgb.jpg").write_bytes(with_thumbnail[:-9])
-    with pytest.raises(ValueError, match="is no image, or a damaged one"):
+    with pytest.raises(ValueError, match="is not an image, or a damaged one"):
         io.read_pixels(tmp_path / "rgb.jpg")
 
 

@@ -82,7 +82,7 @@ def test_an_npy_file_that_ends_too_early_or_has_a_damaged_header_is_found(tmp_pa
     unclosed = content.replace(b"}", b"(")
     for damaged in (*(content[:end] for end in range(0, len(content), 37)), content.replace(b"20,", b"2e,"), unclosed):
         path.write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"a\.npy: is no NPY array, or a damaged one"):
+        with pytest.raises(ValueError, match=r"a\.npy: is not an NPY array, or a damaged one"):
             io.read_depth(path)
 
 
@@ -109,8 +109,8 @@ def test_refuses(tmp_path: Path) -> None:
         ("no.npy", None, r"no\.npy: No such file"),
         ("no.exr", None, r"no\.exr: no such file"),
         ("a.tiff", None, r"a\.tiff: a depth file must end in \.png, \.exr or \.npy"),
-        ("text.npy", None, r"text\.npy: is no NPY array"),
-        ("object.npy", None, r"object\.npy: is no NPY array"),
+        ("text.npy", None, r"text\.npy: is not an NPY array"),
+        ("object.npy", None, r"object\.npy: is not an NPY array"),
         ("deep.npy", None, r"deep\.npy: must be \[H, W\] or \[1, H, W\], got \[2, 3, 4\]"),
         ("words.npy", None, r"words\.npy: must hold one array of numbers"),
     ]:

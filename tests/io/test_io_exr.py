@@ -96,11 +96,11 @@ def test_damage_is_found_wherever_it_is_and_prints_nothing(tmp_path: Path, capsy
     content = path.read_bytes()
     for end in range(0, len(content), 31):
         path.write_bytes(content[:end])
-        with pytest.raises(ValueError, match=r"a\.exr: is no OpenEXR image, or a damaged one"):
+        with pytest.raises(ValueError, match=r"a\.exr: is not an OpenEXR image, or a damaged one"):
             io.read_exr(path)
     for position in range(len(content) // 2, len(content), 31):  # in the compressed numbers
         path.write_bytes(content[:position] + bytes([content[position] ^ 255]) + content[position + 1 :])
-        with pytest.raises(ValueError, match=r"a\.exr: is no OpenEXR image, or a damaged one"):
+        with pytest.raises(ValueError, match=r"a\.exr: is not an OpenEXR image, or a damaged one"):
             io.read_exr(path)
     assert capsys.readouterr().out == ""
 
@@ -108,12 +108,12 @@ def test_damage_is_found_wherever_it_is_and_prints_nothing(tmp_path: Path, capsy
 def test_refuses_to_read(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match=r"no\.exr: no such file"):
         io.read_exr(tmp_path / "no.exr")
-    with pytest.raises(ValueError, match=r"text\.exr: is no OpenEXR image"):
+    with pytest.raises(ValueError, match=r"text\.exr: is not an OpenEXR image"):
         io.read_exr(write_text(tmp_path / "text.exr", "hello"))
     io.write_exr_frame(tmp_path / "half.exr", frame(64, 64))
     content = (tmp_path / "half.exr").read_bytes()
     (tmp_path / "half.exr").write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match=r"half\.exr: is no OpenEXR image, or a damaged one"):
+    with pytest.raises(ValueError, match=r"half\.exr: is not an OpenEXR image, or a damaged one"):
         io.read_exr(tmp_path / "half.exr")
     io.write_exr(tmp_path / "a.exr", {"Q": np.zeros((2, 3))})
     with pytest.raises(ValueError, match=r"a\.exr: has none of a frame's channels; it has Q"):

@@ -66,14 +66,14 @@ def test_damaged_files_are_named(tmp_path: Path, capfd: pytest.CaptureFixture[st
     for name in ("a.png", "a.jpg"):
         path = tmp_path / name
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-        with pytest.raises(ValueError, match=f"{name}: is no image, or a damaged one"):
+        with pytest.raises(ValueError, match=f"{name}: is not an image, or a damaged one"):
             io.read_pixels(path)
     for read in (io.read_pixels, io.read_image, io.image_size):
-        with pytest.raises(ValueError, match=r"text.png: is no image"):
+        with pytest.raises(ValueError, match=r"text.png: is not an image"):
             read(write_text(tmp_path / "text.png", "hello"))
         with pytest.raises(ValueError, match=r"nothing.png: No such file"):
             read(tmp_path / "nothing.png")
-    with pytest.raises(ValueError, match=r"empty.png: is no image"):
+    with pytest.raises(ValueError, match=r"empty.png: is not an image"):
         io.read_pixels(write_text(tmp_path / "empty.png"))
     with pytest.raises(ValueError, match="Is a directory"):
         io.read_pixels(tmp_path)
@@ -97,7 +97,7 @@ def test_a_file_that_ends_too_early_is_found_wherever_it_ends(
     content = encoded(Image.fromarray(picture(40, 50)), kind, **options)
     for end in range(0, len(content), 29):
         path.write_bytes(content[:end])
-        with pytest.raises(ValueError, match=r"a: is no image, or a damaged one$"):
+        with pytest.raises(ValueError, match=r"a: is not an image, or a damaged one$"):
             io.read_pixels(path)
     path.write_bytes(content + b"what a telephone appends")
     assert io.read_pixels(path).shape == (40, 50, 3)
@@ -111,7 +111,7 @@ def test_a_byte_that_changed_in_a_png_is_found(tmp_path: Path) -> None:
         content[position] ^= 4
         path.write_bytes(content)
         for read in (io.read_pixels, lambda name: io.read_train_ids(name, "labelIds")):
-            with pytest.raises(ValueError, match=r"a\.png: is no image, or a damaged one$"):
+            with pytest.raises(ValueError, match=r"a\.png: is not an image, or a damaged one$"):
                 read(path)
         content[position] ^= 4
 

@@ -68,8 +68,8 @@ def test_refuses(tmp_path: Path) -> None:
         ("34.png", "labelIds", r"34\.png: 34 is not one of the labelIds \(0 \.\.\. 33, 255\)"),
         ("34.png", "colours", "`kind` must be trainIds, labelIds or virtual_kitti, got 'colours'"),
         ("19.png", "virtual_kitti", r"19\.png: Virtual KITTI's classes must be 8-bit RGB"),
-        ("rgb.png", "virtual_kitti", r"rgb\.png: \(\d+, \d+, \d+\) is no colour of Virtual KITTI's classes"),
-        ("half.png", "trainIds", r"half\.png: is no image, or a damaged one$"),
+        ("rgb.png", "virtual_kitti", r"rgb\.png: \(\d+, \d+, \d+\) is not a colour of Virtual KITTI's classes"),
+        ("half.png", "trainIds", r"half\.png: is not an image, or a damaged one$"),
         ("no.png", "trainIds", r"no\.png: No such file"),
         ("no.png", "virtual_kitti", r"no\.png: No such file"),
     ]:

@@ -55,7 +55,7 @@ def test_any_order(clip: Path) -> None:
 
 @pytest.mark.parametrize(("suffix", "codec"), [("mp4", "libx264"), ("mkv", "libx264"), ("avi", "mpeg4")])
 def test_frames_that_are_reordered_are_the_same_in_any_order(tmp_path: Path, suffix: str, codec: str) -> None:
-    """Open groups of pictures: those before a key frame in time refer to the group before. AVI has no such times."""
+    """Open groups of images: those before a key frame in time refer to the group before. AVI has no such times."""
     noise = [picture(32, 48, i // 3) // 2 + frame // 2 for i, frame in enumerate(flat(40))]
     options = REORDERED if codec == "libx264" else {"bf": "2"}
     opened = io.Video(write_video(tmp_path / f"a.{suffix}", noise, codec=codec, gop=7, options=options))
@@ -156,7 +156,7 @@ def test_a_file_that_ends_early(tmp_path: Path, suffix: str) -> None:
 
 
 def test_counting_does_not_decode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An hour opens in a second; of these minutes the last frame is a group of pictures away."""
+    """An hour opens in a second; of these minutes the last frame is a group of images away."""
     path = tmp_path / "long.mp4"
     frames = (np.full((16, 16, 3), i % 250, np.uint8) for i in range(3600))
     monkeypatch.setitem(video_writing.ENCODERS, "libx264", {"preset": "ultrafast", "g": "250"})

@@ -1,4 +1,4 @@
-"""Colour maps by their ends and their order, sheets by where things lie."""
+"""Colour maps by their ends and their order, sheets by where objects lie."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -69,14 +69,14 @@ def test_cells_lie_in_rows_and_columns() -> None:
 
 def test_title_and_bar_take_a_line_each() -> None:
     cell = Cell(plain(20, 300, 9, 9, 9))
-    bare, told = sheet.sheet([[cell]]), sheet.sheet([[cell]], title="street", bar=("0", "1"))
-    assert told.shape == (bare.shape[0] + 24 + 24 + 6, 300, 3)
-    assert (told[:24] < 128).any()
-    assert np.array_equal(told[24 : 24 + bare.shape[0]], bare)
-    assert np.array_equal(told[-24:], sheet.scale_bar(300, "0", "1"))
+    bare, titled = sheet.sheet([[cell]]), sheet.sheet([[cell]], title="street", bar=("0", "1"))
+    assert titled.shape == (bare.shape[0] + 24 + 24 + 6, 300, 3)
+    assert (titled[:24] < 128).any()
+    assert np.array_equal(titled[24 : 24 + bare.shape[0]], bare)
+    assert np.array_equal(titled[-24:], sheet.scale_bar(300, "0", "1"))
 
 
-def test_a_bar_wider_than_its_pictures_widens_the_sheet() -> None:
+def test_a_bar_wider_than_its_images_widens_the_sheet() -> None:
     red = plain(20, 30, 255, 0, 0)
     shown = sheet.sheet([[Cell(red)]], bar=("none", "as much as can be"))
     assert shown.shape[1] > 200
@@ -101,7 +101,7 @@ def test_sheet_of_a_forecast() -> None:
     assert {tuple(colour("turbo", 0.0)), tuple(colour("turbo", 1.0))} <= ramp
 
 
-def test_wide_pictures_shrink_by_the_mean() -> None:
+def test_wide_images_shrink_by_the_mean() -> None:
     stripes = np.zeros((8, 40, 3), np.uint8)
     stripes[:, ::2] = 200
     shown = sheet.sheet([[Cell(stripes)]], cell_width=20)
@@ -109,8 +109,8 @@ def test_wide_pictures_shrink_by_the_mean() -> None:
     assert (shown[24:] == 100).all()
 
 
-def test_long_labels_stay_above_their_picture() -> None:
-    label = "a label that is much too long for so narrow a picture"
+def test_long_labels_stay_above_their_image() -> None:
+    label = "a label that is much too long for so narrow an image"
     shown = sheet.sheet([[Cell(plain(9, 60, 1, 1, 1), label), Cell(plain(9, 60, 2, 2, 2))]])
     assert (shown[:24, :60] < 200).any()
     assert (shown[:24, 60:] == sheet.PAPER).all()
@@ -128,13 +128,13 @@ def test_long_labels_stay_above_their_picture() -> None:
         (lambda: sheet.heat(np.full((1, 2, 2), np.nan)), "`error` must not have NaN"),
         (lambda: sheet.scale_bar(20, "0", "much"), "`width` must be [0-9]+ or more for these words, got 20"),
         (lambda: sheet.scale_bar(200, "0", "1", "mud"), "`colours` must be .* got 'mud'"),
-        (lambda: sheet.sheet([]), r"`rows` must be of one length and have a picture, got lengths \[\]"),
-        (lambda: sheet.sheet([[None]]), "have a picture"),
+        (lambda: sheet.sheet([]), r"`rows` must be of one length and have an image, got lengths \[\]"),
+        (lambda: sheet.sheet([[None]]), "have an image"),
         (lambda: sheet.sheet([[Cell(plain(1, 1, 0, 0, 0))], []]), r"got lengths \[0, 1\]"),
         (lambda: sheet.sheet([[Cell(plain(1, 1, 0, 0, 0))]], cell_width=0), "`cell_width` must be 1 or more, got 0"),
         (lambda: sheet.sheet([[Cell(cast(Any, np.zeros((2, 2, 3))))]]), r"uint8, got float64 \[2, 2, 3\]"),
     ],
 )
-def test_mistakes_are_told(call: Callable[[], object], message: str) -> None:
+def test_mistakes_are_reported(call: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()

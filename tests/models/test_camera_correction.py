@@ -102,7 +102,7 @@ def test_the_correction_by_hand(said: float, gate: float) -> None:
             assert shift.tolist() == pytest.approx([share * ACCELERATION * dt * dt * k] * 3, abs=1e-5)
 
 
-def test_a_camera_that_stands_is_not_corrected() -> None:
+def test_a_static_camera_is_not_corrected() -> None:
     """Below 5 m/s it counts by the speed; at rest not at all."""
     for speed, share in ((0.0, 0.0), (2.5, 0.5), (5.0, 1.0), (20.0, 1.0)):
         given = prior(speed=speed)
@@ -118,8 +118,8 @@ def test_samples_of_different_intervals_share_a_batch() -> None:
     mean = torch.randn(3, 8)
     together = network(mean, network.numbers(given), given)
     for sample, seconds in enumerate(SECONDS):
-        alone = prior((seconds,))
-        moved = network(mean[sample : sample + 1], network.numbers(alone), alone)
+        single = prior((seconds,))
+        moved = network(mean[sample : sample + 1], network.numbers(single), single)
         for one, other in zip(moved, together, strict=True):
             torch.testing.assert_close(one.translation[0], other.translation[sample])
             torch.testing.assert_close(one.quaternion[0], other.quaternion[sample])

@@ -121,8 +121,8 @@ def test_how_the_camera_swayed_counts_in_a_line() -> None:
 
 
 @pytest.mark.parametrize(("metres", "share"), [(0.0, 0.0), (0.1, 0.2), (0.5, 1.0), (2.0, 1.0)])
-def test_a_camera_that_stands_is_not_corrected(metres: float, share: float) -> None:
-    """Below half a metre an interval a correction counts by what was measured of it."""
+def test_a_static_camera_is_not_corrected(metres: float, share: float) -> None:
+    """Below half a metre per interval a correction counts by what was measured of it."""
     network, (next_from_cur, cur_from_prev, before) = EgoMotion(PATH, 4, "prior"), random_prior(1)
     with torch.no_grad():
         network.motion.bias.copy_(torch.tensor([[0.0, 0, 0, 0, 0, 1]] * PATH.path).flatten())
@@ -251,8 +251,8 @@ def test_all_is_looked_at_where_no_background_is_left() -> None:
     together = numbers(network, arguments)
     assert together.isfinite().all()
     for i in range(2):
-        alone = numbers(network, {name: value[i : i + 1] for name, value in arguments.items()})
-        assert torch.allclose(together[i : i + 1], alone, atol=1e-5)
+        single = numbers(network, {name: value[i : i + 1] for name, value in arguments.items()})
+        assert torch.allclose(together[i : i + 1], single, atol=1e-5)
     changed = arguments | {"features_cur": arguments["features_cur"] + 1}
     assert not torch.allclose(numbers(network, changed)[1], together[1], atol=1e-2)
 

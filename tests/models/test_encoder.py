@@ -99,8 +99,8 @@ def test_features_of_the_named_models(name: str) -> None:
 
 def test_images_do_not_see_each_other() -> None:
     encoder, images = Encoder(SMALL), torch.rand(3, 3, 32, 48)
-    alone = torch.cat([encoder(image[None]) for image in images])
-    assert torch.allclose(encoder(images), alone, atol=1e-5)
+    single = torch.cat([encoder(image[None]) for image in images])
+    assert torch.allclose(encoder(images), single, atol=1e-5)
 
 
 def test_float64() -> None:

@@ -94,7 +94,7 @@ def test_a_gradient_for_every_tensor(name: str) -> None:
 
 
 def test_motion_learns_from_the_splatted_colour() -> None:
-    """Refinement left out: forward and backward as the splatter gives them, down to a smooth picture's shift."""
+    """Refinement left out: forward and backward as the splatter gives them, down to a smooth image's shift."""
     model, K = drive(Forecaster(change(object_motion=None)), (0.6, 0, 0), (0.3, 0, 0)), camera(1, 32, 48)
     assert model.ego_motion is not None
     scene = wall(32, 48, 10.0)
@@ -152,7 +152,7 @@ def test_the_encoder_learns_from_the_cameras_motion() -> None:
 
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_every_ablation_goes_back_and_forth(name: str) -> None:
-    """Refinement learns; the others' steps on a random picture are no sure gain, but all have a finite gradient."""
+    """Refinement learns; the others' steps on a random image are no sure gain, but all have a finite gradient."""
     model, pair, K = Forecaster(ABLATIONS[name]), pair_of(1, 32, 48), camera(1, 32, 48)
     optimiser = torch.optim.SGD(model.refine.parameters(), 1e-3)
     truth, losses = torch.rand(1, 3, 32, 48), []
@@ -182,8 +182,8 @@ def test_a_batch_is_its_images(joint: bool) -> None:
         together = model(*pair, K, views)
         for b in range(2):
             one = slice(b, b + 1)
-            alone = [LayerBatch(*(tensor[one] for tensor in layers)) for layers in pair]
-            step = model(*alone, K[one], [(pose[one], cameras[one]) for pose, cameras in views])
+            single = [LayerBatch(*(tensor[one] for tensor in layers)) for layers in pair]
+            step = model(*single, K[one], [(pose[one], cameras[one]) for pose, cameras in views])
             for view, whole in zip(step.views, together.views, strict=True):
                 for name in view._fields:
                     got, wanted = getattr(view, name), getattr(whole, name)[one]

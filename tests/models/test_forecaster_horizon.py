@@ -32,12 +32,12 @@ from vestcl.models.forecaster import Forecaster, Step
 def test_a_horizon_is_the_forecasts_last_step(name: str) -> None:
     model, K = stir(Forecaster(SMALL if name == "small" else TINY)).eval(), camera(2, 32, 48)
     pair, prior = pair_of(2, 32, 48), measured(2, 32, 48, cur=(0.1, 0, -0.5)) if name == "small" else None
-    beside = torch.eye(4).repeat(2, 1, 1)
-    beside[:, 0, 3] = -0.5
+    offset = torch.eye(4).repeat(2, 1, 1)
+    offset[:, 0, 3] = -0.5
     with torch.no_grad():
-        steps = model.forecast(*pair, K, 3, [(beside, K)], "compose", prior=prior)
+        steps = model.forecast(*pair, K, 3, [(offset, K)], "compose", prior=prior)
         for k in (1, 2, 3):
-            assert_same(model(*pair, K, [(beside, K)], prior=prior, horizon=k), steps[k - 1])
+            assert_same(model(*pair, K, [(offset, K)], prior=prior, horizon=k), steps[k - 1])
 
 
 @pytest.mark.parametrize("mode", ["feedback", "compose"])
@@ -50,7 +50,7 @@ def test_only_what_is_shown_is_rendered(mode: Any) -> None:
         painted.clear()
         some = model.forecast(*pair, K, 3, None, mode, plain, prior=prior, shown=(1, 3))
     assert [len(step.views) for step in some] == [1, 0, 1]
-    assert len(painted) == (2 if mode == "compose" else 3)  # feedback has to see what it goes on from
+    assert len(painted) == (2 if mode == "compose" else 3)  # feedback has to see what it continues from
     assert_same(some[0], whole[0])
     assert_same(some[2], whole[2])
     assert torch.equal(some[1].future_from_cur, whole[1].future_from_cur)
@@ -67,7 +67,7 @@ def assert_same(got: Step, wanted: Step) -> None:
 
 @pytest.mark.parametrize("horizon", [1, 3])
 def test_a_gradient_for_every_tensor(horizon: int) -> None:
-    """From the image, and at t + 3 through what moved beside the camera, too."""
+    """From the image, and at t + 3 through what moved relative to the world, too."""
     model, pair, K = stir(Forecaster(SMALL)), pair_of(2, 32, 48), camera(2, 32, 48)
     nn.init.normal_(model.refine.out.weight, std=0.1)
     assert isinstance(model.ego_motion, EgoMotion)

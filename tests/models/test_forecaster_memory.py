@@ -285,7 +285,7 @@ def test_copies_begin_with_an_empty_memory() -> None:
         assert tally.counts["seen"] == (0, 2, "frames")
 
 
-def test_each_thread_has_room_for_two_frames() -> None:
+def test_each_thread_keeps_two_frames() -> None:
     """In turns with other threads each finds its own frames again; beyond eight frames the oldest go."""
     memory, images = (
         EncodedFrames(),

@@ -15,7 +15,7 @@ from vestcl.models.steps.render import Side, compose_view
 # ---------------------------------------------------------------- by hand
 
 
-def test_at_rest_the_picture_stays() -> None:
+def test_at_rest_the_image_stays() -> None:
     model, pair, K = Forecaster(SHARP), pair_of(2, 33, 50, foreground=False), camera(2, 33, 50)
     step, sides = sides_of(model, *pair, K)
     for side, source in zip(sides, pair, strict=True):
@@ -43,7 +43,7 @@ def test_each_frame_goes_to_the_next_directly() -> None:
 
 
 def test_the_radius_grows_with_what_comes_nearer() -> None:
-    """A wall at 10 m seen from 5 m further on: each point covers 2 x 2 pixels, and the picture stays closed."""
+    """A wall at 10 m seen from 5 m further on: each point covers 2 x 2 pixels, and the image stays closed."""
     model = drive(Forecaster(SHARP), prev=(0, 0, -5.0), cur=(0, 0, -5.0))
     step, sides = sides_of(model, wall(32, 48, 10.0), wall(32, 48, 10.0), camera(1, 32, 48))
     for side in sides:
@@ -67,7 +67,7 @@ def test_the_sky_only_turns() -> None:
     assert torch.allclose(still, driving, atol=0.01)
 
 
-def test_inpainted_points_follow_the_camera_alone() -> None:
+def test_inpainted_points_follow_the_camera_only() -> None:
     model, K = drive(push(Forecaster(TINY), *(5.0,) * 6), (2.0, 0, 0), (1.0, 0, 0)), camera(1, 32, 48)
     prev, cur = (model.encode(frame(1, 32, 48)) for _ in range(2))
     first, second = model.lift(prev, cur, model.move(prev, cur, K), K)

@@ -63,7 +63,7 @@ def test_composed_frames_go_along_the_path() -> None:
 
 
 @pytest.mark.parametrize("mode", ["feedback", "compose"])
-def test_every_step_tells_the_path_of_the_first(mode: Any) -> None:
+def test_every_step_reports_the_path_of_the_first(mode: Any) -> None:
     """Composed or fed back, the steps follow it: a forecast motion is not corrected again."""
     model, scene, prior = stir(Forecaster(SMALL)).eval(), pair_of(2, 32, 48), turning(2, 32, 48)
     with torch.no_grad():

@@ -49,13 +49,13 @@ def test_untrained_it_forecasts_the_prior() -> None:
     assert torch.equal(motion.start, motion.objects.flow)
 
 
-def test_without_ego_motion_things_move_as_measured() -> None:
+def test_without_ego_motion_objects_move_as_measured() -> None:
     pair, K, prior = pair_of(1, 32, 48), camera(1, 32, 48), turning(1, 32, 48)
     motion = Forecaster(dataclasses.replace(SMALL, ego_motion=None))(*pair, K, prior=prior).motion
     assert torch.allclose(motion.objects.flow, torch.cat([2 * prior.velocity_prev, prior.velocity_cur], dim=1))
 
 
-def test_without_object_motion_things_stand() -> None:
+def test_without_object_motion_objects_are_static() -> None:
     pair, K, prior = pair_of(1, 32, 48), camera(1, 32, 48), turning(1, 32, 48)
     motion = Forecaster(dataclasses.replace(SMALL, object_motion=None))(*pair, K, prior=prior).motion
     assert torch.equal(motion.objects.flow, motion.flow0) and motion.flow0.abs().max() > 0.5
@@ -120,7 +120,7 @@ def before_a_wall(layers: LayerBatch, behind: float) -> LayerBatch:
 
 @pytest.mark.parametrize("mode", ["feedback", "compose"])
 def test_what_moves_once_moves_on(mode: Any) -> None:
-    """The camera goes 1 m a frame to the left before something at 10 m that goes 0.5 m to the right: 4.5 px a frame."""
+    """The camera moves 1 m per frame to the left, an object at 10 m 0.5 m to the right: 4.5 px per frame."""
     prior = measured(1, 32, 64, cur=(1, 0, 0), velocity=(0.5, 0, 0))
     model, scene = Forecaster(PAINTING).eval(), before_a_wall(wall(32, 64, 10.0), 10)
 
@@ -135,7 +135,7 @@ def test_what_moves_once_moves_on(mode: Any) -> None:
         assert step.future_from_cur[0, :3, 3].tolist() == pytest.approx([k, 0, 0], abs=1e-5)
 
 
-def test_feedback_goes_on_as_composed_while_the_camera_turns() -> None:
+def test_feedback_continues_as_composed_while_the_camera_turns() -> None:
     """What is seen at t + 2 and t + 3 is where constant velocity in the world takes it, in both modes."""
     turn = RigidMotion(torch.tensor([[1.0, 0, 0.01, 0]]), torch.tensor([[0.0, 0, -0.5]]))
     velocity = torch.tensor([0.2, 0.0, -0.1])[:, None, None].expand(1, 3, 32, 64)

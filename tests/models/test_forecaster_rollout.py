@@ -85,15 +85,15 @@ def test_the_source_camera_is_a_view_like_any_other(mode: Any, name: str) -> Non
     """Asked for, not asked for, or among others: the recursion is the same."""
     model, K = stir(Forecaster(ABLATIONS[name])).eval(), camera(2, 32, 48)
     pair = pair_of(2, 32, 48)
-    straight, beside = torch.eye(4).repeat(2, 1, 1), torch.eye(4).repeat(2, 1, 1)
-    beside[:, 0, 3] = -0.5
+    straight, offset = torch.eye(4).repeat(2, 1, 1), torch.eye(4).repeat(2, 1, 1)
+    offset[:, 0, 3] = -0.5
     with torch.no_grad():
-        alone, both, other = (
+        single, both, other = (
             model.forecast(*pair, K, steps=3, views=views, mode=mode, perceive=plain)
-            for views in (None, [(beside, K), (straight, K)], [(beside, K)])
+            for views in (None, [(offset, K), (straight, K)], [(offset, K)])
         )
-    assert len(alone) == len(both) == len(other) == 3
-    for one, two, three in zip(alone, both, other, strict=True):
+    assert len(single) == len(both) == len(other) == 3
+    for one, two, three in zip(single, both, other, strict=True):
         assert [len(step.views) for step in (one, two, three)] == [1, 2, 1]
         for name_ in one.views[0]._fields:
             assert torch.equal(getattr(one.views[0], name_), getattr(two.views[1], name_)), name_
@@ -102,7 +102,7 @@ def test_the_source_camera_is_a_view_like_any_other(mode: Any, name: str) -> Non
 
 
 def test_composed_motion_repeats_the_camera_and_the_objects() -> None:
-    """1 m a step of the camera and 0.5 m of everything else, at 10 m: 4.5 px a step."""
+    """1 m a step of the camera and 0.5 m of everything else, at 10 m: 4.5 px per step."""
     model = push(drive(Forecaster(SHARP), (2.0, 0, 0), (1.0, 0, 0)), 1.0, 0, 0, 0.5, 0, 0).eval()
     scene = wall(32, 64, 10.0)
     with torch.no_grad():

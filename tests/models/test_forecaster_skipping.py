@@ -22,7 +22,7 @@ from vestcl.models.steps.encode import encode
 from vestcl.models.steps.render import _reaching
 from vestcl.scene.layers import LayerBatch
 
-#: As vest-s in all that can be skipped, and with convolutions that reach so little that a picture has room around it.
+#: As vest-s in all that can be skipped, and with convolutions that reach so little that an image has room around it.
 ENCODER = EncoderConfig(widths=(8, 8, 8), blocks=(1, 1, 1), decoder=(8, 8), features=4, background="frame")
 SPARE = dataclasses.replace(
     SMALL,
@@ -53,7 +53,7 @@ def forecast(model: Forecaster, pair: tuple[LayerBatch, LayerBatch], options: In
 
 @pytest.fixture(autouse=True)
 def small_boxes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In so small pictures, too."""
+    """In so small images, too."""
     monkeypatch.setattr(skipping, "_PASS", 0)
     monkeypatch.setattr(skipping, "_WHOLE", 1.0)
 
@@ -84,7 +84,7 @@ def test_a_switch_changes_nothing_but_rounding(switch: str, batch: int, foregrou
     assert 0 < count.skipped < count.of or (not foreground and count.skipped == count.of)
 
 
-def test_without_foreground_nothing_moves_by_itself() -> None:
+def test_without_foreground_nothing_is_dynamic() -> None:
     """u = rigid flow and what was measured, bit by bit; neither backgrounds nor object motion run."""
     network, ran = model(), list[str]()
     assert network.object_motion is not None
@@ -97,7 +97,7 @@ def test_without_foreground_nothing_moves_by_itself() -> None:
         assert tally.counts[switch].skipped == tally.counts[switch].of > 0
 
 
-def test_what_stands_is_taken_to_stand() -> None:
+def test_what_is_static_is_kept_static() -> None:
     """Of two cars the one that was measured to move; a pixel alone does not."""
     network, (prev, cur), K = model(), scene(), camera(1, HEIGHT, WIDTH)
     for one in (prev, cur):
@@ -126,7 +126,7 @@ def test_static_background_keeps_its_motion() -> None:
     assert torch.equal(moved & ~foreground, torch.zeros_like(moved)) and moved[foreground].float().mean() > 0.9
 
 
-def test_background_features_are_those_of_the_whole_picture() -> None:
+def test_background_features_are_those_of_the_whole_image() -> None:
     """Of a crop with the receptive field as margin, inside; a margin too small shows."""
     torch.manual_seed(1)
     encoder, (one, _) = Encoder(ENCODER), scene()
@@ -276,7 +276,7 @@ def test_a_copy_remembers_nothing_of_other_weights(tmp_path: Path) -> None:
     assert not torch.equal(before.views[0].image, again.views[0].image)
 
 
-def test_the_inpainted_shows_in_inner_holes_alone() -> None:
+def test_the_inpainted_shows_in_inner_holes_only() -> None:
     """A block in the middle and one at the border leave holes; the splatted background is behind the first alone."""
     torch.manual_seed(2)
     network, K = Forecaster(SPARE).eval(), camera(1, HEIGHT, WIDTH)
@@ -287,7 +287,7 @@ def test_the_inpainted_shows_in_inner_holes_alone() -> None:
     cur = rear._replace(depth=depth, mask=mask, image=torch.where(mask > 0, rear.image, 0.5))
     gone = measured(1, HEIGHT, WIDTH, velocity=(0, 0, 0))
     aside = gone.velocity_cur.clone()
-    aside[:, 1] = torch.where(mask[:, 0] > 0, 0.0, 60.0)  # both leave the picture, as all of the frame before
+    aside[:, 1] = torch.where(mask[:, 0] > 0, 0.0, 60.0)  # both leave the image, as all of the frame before
     gone = gone._replace(velocity_prev=torch.full_like(aside, 60.0) * torch.tensor([0.0, 1, 0])[:, None, None])
     gone = gone._replace(velocity_cur=aside)
     seen = {}
@@ -308,7 +308,7 @@ def test_inner_holes_need_to_know_what_is_open() -> None:
 
 
 def test_no_point_is_left_out_that_reaches_an_open_pixel() -> None:
-    """Of two pictures, with points beside them, at their borders and nowhere; transparent ones reach nothing."""
+    """Of two images, with points next to them, at their borders and nowhere; transparent ones reach nothing."""
     generator = torch.Generator().manual_seed(0)
     open_ = torch.rand(2, 1, 40, 60, generator=generator) < 0.004
     points_uv = torch.rand(6000, 2, generator=generator) * torch.tensor([80.0, 60]) - 10

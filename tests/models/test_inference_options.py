@@ -96,9 +96,9 @@ def test_fewer_blocks_reach_less() -> None:
     assert network.reach == network.reach_of(2) > network.reach_of(1) > network.reach_of(0) == 0
 
 
-def test_a_network_that_paints_anew_has_nothing_to_enlarge() -> None:
+def test_a_network_that_predicts_rgb_has_nothing_to_enlarge() -> None:
     model = stir(Forecaster(dataclasses.replace(PAINTING))).eval()
-    with pytest.raises(ValueError, match=r"`options\.paint_scale` must be 1 for tiny, which paints anew"):
+    with pytest.raises(ValueError, match=r"`options\.paint_scale` must be 1 for tiny, which predicts RGB directly"):
         forecast(model, scene(), paint_scale=0.5)
 
 

@@ -152,7 +152,7 @@ def test_one_convolution_a_size_and_forecast(monkeypatch: pytest.MonkeyPatch) ->
     assert sorted(looked) == sorted(2 * [(12, 32 // scale, 48 // scale) for scale in set(DEEP.scales)])
 
 
-def test_new_frames_are_looked_at_anew() -> None:
+def test_new_frames_are_looked_at_again() -> None:
     convs = [MotionConv(5, channels, 2).requires_grad_(False) for channels in (3, 4)]
     joint = JointConv(convs)
     one, other, flow = torch.randn(1, 5, 8, 8), torch.randn(1, 5, 8, 8), torch.randn(1, 6, 8, 8)
@@ -228,7 +228,7 @@ def test_gradients_are_refused() -> None:
     assert quick.eval() is quick and quick.requires_grad_(False) is quick
 
 
-def test_mistakes_are_told() -> None:
+def test_mistakes_are_reported() -> None:
     model = trained(dataclasses.replace(TINY, name="slow"))
     with pytest.raises(ValueError, match="`precision` must be one of float32, bfloat16, got 'float16'"):
         accelerate(model, "float16")  # type: ignore[arg-type]
@@ -249,7 +249,7 @@ def test_processors_with_bfloat16(names: dict[str, bool], wanted: bool, monkeypa
     assert fast.computes_bfloat16() is False
 
 
-def test_freed_memory_is_kept_with_glibc_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_freed_memory_is_kept_with_glibc_only(monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[tuple[int, int]] = []
 
     class Library:

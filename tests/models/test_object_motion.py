@@ -233,9 +233,9 @@ def test_each_scene_of_a_batch_has_its_own_blocks() -> None:
     assert len({tuple(ran) for ran in together.ran.tolist()}) > 1
     assert sizes == [count for count in together.ran.sum(dim=0).tolist() if count]
     for i in range(8):
-        alone = network(**{name: value[i : i + 1] for name, value in arguments.items()})
-        assert torch.equal(alone.ran[0], together.ran[i])
-        assert torch.allclose(alone.flow[0], together.flow[i], atol=1e-5)
+        single = network(**{name: value[i : i + 1] for name, value in arguments.items()})
+        assert torch.equal(single.ran[0], together.ran[i])
+        assert torch.allclose(single.flow[0], together.flow[i], atol=1e-5)
 
 
 def test_training_draws_the_blocks_and_judges_all_of_them() -> None:

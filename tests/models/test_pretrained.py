@@ -64,12 +64,14 @@ def test_by_name(model: Forecaster, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert shipped.shipped() == {"vest-s": path}
     assert same(Forecaster.from_pretrained("vest-s"), model)
     assert shipped.about_model("vest-s")["model_file"] == "vest-s.safetensors"
-    with pytest.raises(ValueError, match="is no model"):  # a path is no name
+    with pytest.raises(ValueError, match="is not a model"):  # a path is not a name
         Forecaster.from_pretrained(Path("vest-s"))
 
 
 def test_errors(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="vest-xl: is no model: no file, no checkpoint's folder, and none of vest-s"):
+    with pytest.raises(
+        ValueError, match="vest-xl: is not a model: no file, no checkpoint's folder, and none of vest-s"
+    ):
         Forecaster.from_pretrained("vest-xl")
     with pytest.raises(ValueError, match=r"must have ema.safetensors or model.safetensors, as a training checkpoint"):
         Forecaster.from_pretrained(tmp_path)

@@ -22,7 +22,7 @@ FIGURES = Path(__file__).parents[2] / "docs" / "time_against_error" / "pareto.js
 #: Streets of this test's own, in small.
 SEEDS, SIZE = (1107, 1108), (64, 208)
 
-#: Of a picture's values, root of the mean square: what float32 and each level may differ from "exact" by.
+#: Of an image's values, root of the mean square: what float32 and each level may differ from "exact" by.
 DIFFERENCE: dict[Quality, float] = {"exact": 1e-6, "balanced": 0.02, "fast": 0.04}
 
 
@@ -82,14 +82,14 @@ def test_bfloat16_where_the_processor_has_it(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("config", [TINY, PAINTING])
-def test_networks_that_paint_anew_paint_at_full_size(config: type) -> None:
+def test_networks_that_predict_rgb_run_at_full_size(config: type) -> None:
     assert quality.apply(Forecaster(config), "fast").options.paint_scale == 1
 
 
-def test_what_files_tell() -> None:
-    told = quality.about("balanced")
-    assert told["quality"] == "balanced" and told["skip"]["margin"] == quality.settings("balanced").margin
-    assert set(told) == {"quality", "skip", "effort", "autocast"} and "min_transmittance" in told["effort"]
+def test_what_files_contain() -> None:
+    reported = quality.about("balanced")
+    assert reported["quality"] == "balanced" and reported["skip"]["margin"] == quality.settings("balanced").margin
+    assert set(reported) == {"quality", "skip", "effort", "autocast"} and "min_transmittance" in reported["effort"]
 
 
 def test_refuses() -> None:

@@ -71,8 +71,8 @@ def test_levels() -> None:
 
 def test_images_do_not_see_each_other() -> None:
     network, rendered = small(), torch.rand(3, 16, 16, 24)
-    alone = torch.cat([network(one[None]) for one in rendered])
-    assert torch.allclose(network(rendered), alone, atol=1e-5)
+    single = torch.cat([network(one[None]) for one in rendered])
+    assert torch.allclose(network(rendered), single, atol=1e-5)
 
 
 @pytest.mark.parametrize("base", ["none", "splatted", "filled"])

@@ -149,7 +149,7 @@ def assert_same(got: Forecast, wanted: Forecast) -> None:
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_two_forecasts_at_once_on_one_model(quick: bool) -> None:
-    """Each has the pictures, the times and the counts that it has by itself."""
+    """Each has the images, the times and the counts that it has by itself."""
     network = accelerate(model()) if quick else model()
     perceptions = [Perception(drive(seed)) for seed in (3, 4)]
     few, many = [SOURCE], [SOURCE, View("again", np.eye(4)), View("third", np.eye(4))]
@@ -163,15 +163,15 @@ def test_two_forecasts_at_once_on_one_model(quick: bool) -> None:
     for known in range(3):
         found = at_once(*(lambda number=number: task(network, number) for number in range(2)))
         assert all(vars(network)[name] is value for name, value in before.items())
-        for got, alone, (shown, twice) in zip(found, wanted, ((2, 0), (9, 6)), strict=True):
-            assert_same(got, alone)
+        for got, single, (shown, twice) in zip(found, wanted, ((2, 0), (9, 6)), strict=True):
+            assert_same(got, single)
             assert list(got.profile) == [*STAGES.values(), REST]
             assert sum(got.profile.values()) == pytest.approx(got.seconds["network"], rel=1e-6)
             assert all(got.profile[name] > 0 for name in STAGES.values())
             assert got.skipped["views"][:3] == (twice, shown, "views")
             assert got.skipped["seen"][:3] == (2 * (known > 0), 2, "frames")
             for switch in got.skipped.keys() - {"seen", "background"}:  # what is known is not encoded
-                assert got.skipped[switch][:3] == alone.skipped[switch][:3]
+                assert got.skipped[switch][:3] == single.skipped[switch][:3]
 
 
 def test_many_threads_share_a_clip_a_model_and_what_was_perceived() -> None:

@@ -77,8 +77,8 @@ def test_routing_runs_what_it_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     assert calls == [0, 4, 8]
     for scene in range(2):
         monkeypatch.setattr(torch, "bernoulli", lambda _, own=scene: draws[own : own + 1])
-        alone = network(first[scene : scene + 1], second[scene : scene + 1])
-        torch.testing.assert_close(both[scene : scene + 1], alone)
+        single = network(first[scene : scene + 1], second[scene : scene + 1])
+        torch.testing.assert_close(both[scene : scene + 1], single)
     assert calls == [0, 4, 8, 0, 8, 4]
 
 

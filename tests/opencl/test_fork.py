@@ -95,7 +95,7 @@ try:
     list(torch.utils.data.DataLoader(Points(), num_workers=1, multiprocessing_context="fork", timeout=60))
 except Exception as error:
     print("loader |", "DeviceError" in type(error).__name__, "spawn" in str(error), "| 7")
-assert torch.equal(unproject(), wanted), "the parent goes on"
+assert torch.equal(unproject(), wanted), "the parent continues"
 """
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
@@ -111,28 +111,28 @@ def ends(code: str) -> dict[str, tuple[str, str]]:
     assert done.returncode == 0, done.stdout + done.stderr
     assert "leaked" not in done.stderr and "rror" not in done.stderr, done.stderr
     lines = [line.split(" | ") for line in done.stdout.splitlines()]
-    return {name: (told, status) for name, told, status in lines}
+    return {name: (reported, status) for name, reported, status in lines}
 
 
-def assert_refused(told: tuple[str, str]) -> None:
-    error, status = told
+def assert_refused(reported: tuple[str, str]) -> None:
+    error, status = reported
     assert status == "7", error
     assert error.startswith("DeviceError: OpenCL was used before this process was forked")
     assert "'spawn'" in error and "'forkserver'" in error and "multiprocessing_context" in error
 
 
 def test_having_listed_the_devices_is_enough() -> None:
-    told = ends(DEVICES_ONLY)
+    reported = ends(DEVICES_ONLY)
     for name in ("devices", "select", "use", "current", "child's child"):
-        assert_refused(told[name])
+        assert_refused(reported[name])
     for name in ("before", "exit", "free", "grandchild"):
-        assert told[name] == ("passed", "7"), name
+        assert reported[name] == ("passed", "7"), name
 
 
-def test_whatever_was_in_use_is_refused_and_the_parent_goes_on() -> None:
-    told = ends(USED)
-    assert told.pop("exit") == told.pop("exit inside a job") == ("passed", "7")
-    assert told.pop("loader") == ("True True", "7")
-    assert len(told) == 10
-    for end in told.values():
+def test_whatever_was_in_use_is_refused_and_the_parent_continues() -> None:
+    reported = ends(USED)
+    assert reported.pop("exit") == reported.pop("exit inside a job") == ("passed", "7")
+    assert reported.pop("loader") == ("True True", "7")
+    assert len(reported) == 10
+    for end in reported.values():
         assert_refused(end)

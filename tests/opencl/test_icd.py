@@ -47,7 +47,9 @@ def test_a_folder_a_fifo_and_a_dangling_link(vendors: Path) -> None:
     os.mkfifo(vendors / "b.icd")
     (vendors / "c.icd").symlink_to("nowhere")
     assert icd.drivers() == []
-    for line, fault in zip(icd.faults(), ("is a folder", "is no regular file", "can't be read (No such"), strict=True):
+    for line, fault in zip(
+        icd.faults(), ("is a folder", "is not a regular file", "can't be read (No such"), strict=True
+    ):
         assert fault in line
 
 

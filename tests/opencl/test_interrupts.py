@@ -194,7 +194,7 @@ def test_use_ends_with_its_block_though_interrupted() -> None:
     assert opencl.current() is before
 
 
-def test_use_without_a_block_goes_on() -> None:
+def test_use_without_a_block_continues() -> None:
     """Whatever looks at it, and however often it is called; and blocks go back to it."""
 
     def choose() -> None:
@@ -225,7 +225,7 @@ def test_an_interrupted_observer_hears_no_more() -> None:
 
 
 def test_stress() -> None:
-    """A tenth of the interrupts of `make stress`, in a process of its own, which may crash."""
+    """A tenth of the interrupts of `make stress`, in a separate process, which may crash."""
     script = Path(__file__).parents[1] / "stress" / "interrupts.py"
     done = subprocess.run([sys.executable, script, "--share", "0.1"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

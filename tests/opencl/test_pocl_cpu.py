@@ -68,7 +68,7 @@ def test_name_cpu_replaces_generic(monkeypatch: pytest.MonkeyPatch) -> None:
     assert pocl_cpu.host_key() == "haswell"
 
 
-def test_name_cpu_leaves_other_names_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_name_cpu_keeps_other_names(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pocl_cpu, "_host_flags", lambda: AVX2)
     structure = Structure(b"generic-rv64")
     assert pocl_cpu.name_cpu(structure.address) is None

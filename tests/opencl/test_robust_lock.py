@@ -95,7 +95,7 @@ def test_an_interrupted_holder_holds_no_more() -> None:
     assert takes(lock, 5) and all(block.left == 0 for block in kept)
 
 
-def test_a_waiting_thread_goes_on_when_the_holder_is_interrupted() -> None:
+def test_a_waiting_thread_continues_when_the_holder_is_interrupted() -> None:
     lock, block = RobustLock(), Block(RobustLock())
     block.lock = lock
     leave = block.__exit__

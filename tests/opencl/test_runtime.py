@@ -72,7 +72,7 @@ def test_select_by_index_and_by_any_part_of_a_name() -> None:
         assert opencl.select(info.index) == info
         assert info.platform == opencl.select(info.platform.upper()).platform
         assert info.name == opencl.select(info.name[2:].lower()).name
-    assert "PoCL 3.0" in opencl.select("pocl 3.0").driver  # pip's, beside whichever the system has
+    assert "PoCL 3.0" in opencl.select("pocl 3.0").driver  # pip's, next to whichever the system has
 
 
 def test_select_by_environment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -277,7 +277,7 @@ def test_an_observer_hears_of_every_outermost_job(kernels: Path, fresh: opencl.S
             assert job.start_ns <= launch.start_ns - low and launch.end_ns - high <= job.end_ns
 
 
-def test_an_observer_is_told_the_rest_when_a_job_fails(kernels: Path, fresh: opencl.Session) -> None:
+def test_an_observer_is_notified_when_a_job_fails(kernels: Path, fresh: opencl.Session) -> None:
     heard: list[opencl.JobTimes] = []
     with opencl.observe(heard.append):
         test_a_failed_job_frees_the_session(kernels, fresh)
@@ -354,7 +354,7 @@ def test_a_profile_and_an_observer_begin_while_a_job_runs(kernels: Path, fresh: 
 
 
 def test_the_leftovers_of_a_failed_job_inside_another(kernels: Path, fresh: opencl.Session) -> None:
-    """The outer one goes on."""
+    """The outer one continues."""
     array, result = np.ones(100, np.float32), np.empty(100, np.float32)
 
     def fail() -> None:

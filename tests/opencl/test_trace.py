@@ -40,7 +40,7 @@ def lies_in(inner: Event, outer: Event) -> bool:
 
 @pytest.fixture
 def traced(session: opencl.Session, tmp_path: Path) -> list[Event]:
-    """Two stages with kernels, one in the other, and one beside them in another thread."""
+    """Two stages with kernels, one in the other, and one next to them in another thread."""
 
     def elsewhere() -> None:
         with opencl.use(session.info.index), trace.stage("other thread"):
@@ -162,7 +162,7 @@ def test_a_device_may_count_from_any_time(session: opencl.Session, ahead: int) -
         assert kernel.end <= recording.began + 300 and kernel.end - kernel.start == 30
 
 
-def test_a_driver_that_does_not_tell_when_kernels_are_queued(session: opencl.Session) -> None:
+def test_a_driver_that_does_not_report_when_kernels_are_queued(session: opencl.Session) -> None:
     recording = trace._Recording()
     recording._clocks[session] = recording.began, 7
     launch = opencl.Launch("kernel", recording.began + 10, 0, 0, recording.began + 27, recording.began + 37)

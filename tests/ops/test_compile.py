@@ -17,7 +17,7 @@ from vestcl.ops.splat import composite, rasterize, skipped, splat
 from vestcl.ops.stretch import stretch
 from vestcl.ops.unproject import unproject
 
-# torch's own, where it looks at a tensor that is no leaf
+# torch's own, where it looks at a tensor that is not a leaf
 pytestmark = pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 
 Values = dict[str, torch.Tensor]

@@ -1,4 +1,4 @@
-"""vestcl.ops.displace against its twin and by hand."""
+"""vestcl.ops.displace against the reference implementation and by hand."""
 
 import math
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tolerances import assert_close, assert_like_twin
+from tolerances import assert_close, assert_like_reference
 from torch.autograd import gradcheck
 
 from vestcl import geometry, opencl, reference
@@ -44,19 +44,19 @@ def test_by_hand(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("moved_camera", [True, False])
 @pytest.mark.parametrize(("batch", "count"), [(1, 1), (3, 100), (2, 5000)])
-def test_like_twin(
+def test_like_reference(
     mapped_session: opencl.Session, dtype: torch.dtype, batch: int, count: int, moved_camera: bool
 ) -> None:
     arguments = scene(batch, count, dtype)
     if not moved_camera:
         del arguments["tgt_from_src"]
-    assert_like_twin(displace, reference.displace, **arguments)
+    assert_like_reference(displace, reference.displace, **arguments)
 
 
 def test_any_last_row_of_the_intrinsics(session: opencl.Session, dtype: torch.dtype) -> None:
     arguments = scene(2, 100, dtype)
     arguments["K"][:, 2] = torch.tensor([0.01, -0.02, 1.5], dtype=dtype)
-    assert_like_twin(displace, reference.displace, **arguments)
+    assert_like_reference(displace, reference.displace, **arguments)
 
 
 def test_gradcheck(mapped_session: opencl.Session, float64: torch.dtype) -> None:
@@ -69,7 +69,7 @@ def test_gradcheck(mapped_session: opencl.Session, float64: torch.dtype) -> None
 def test_only_the_gradient_asked_for(session: opencl.Session, asked: str) -> None:
     arguments = {name: value.detach() for name, value in scene(2, 50, torch.float32).items()}
     arguments[asked].requires_grad_()
-    assert_like_twin(displace, reference.displace, **arguments)
+    assert_like_reference(displace, reference.displace, **arguments)
 
 
 def test_the_two_gradients_are_equal_and_not_the_same_memory(session: opencl.Session) -> None:
@@ -82,9 +82,9 @@ def test_the_two_gradients_are_equal_and_not_the_same_memory(session: opencl.Ses
 
 
 @pytest.mark.parametrize("output", [0, 1])
-def test_gradient_of_one_output_alone(session: opencl.Session, output: int) -> None:
+def test_gradient_of_one_output_only(session: opencl.Session, output: int) -> None:
     arguments = scene(2, 50, torch.float32)
-    assert_like_twin(lambda **a: displace(**a)[output], lambda **a: reference.displace(**a)[output], **arguments)
+    assert_like_reference(lambda **a: displace(**a)[output], lambda **a: reference.displace(**a)[output], **arguments)
 
 
 def test_unprojected_pixels_come_back_to_their_centres(session: opencl.Session, dtype: torch.dtype) -> None:
@@ -115,7 +115,7 @@ def test_behind_the_camera_is_projected_through_it(session: opencl.Session, dtyp
     with torch.no_grad():
         arguments["points_xyz"] *= -1
     assert (displace(**arguments)[1] < 0).all()
-    assert_like_twin(displace, reference.displace, **arguments)
+    assert_like_reference(displace, reference.displace, **arguments)
 
 
 def test_points_that_have_no_image_touch_nothing_else(mapped_session: opencl.Session) -> None:
@@ -126,13 +126,13 @@ def test_points_that_have_no_image_touch_nothing_else(mapped_session: opencl.Ses
         arguments["displacement_xyz"][0, :4] = 0
         arguments["points_xyz"][0, :4] = torch.tensor([[0.0, 0, 0], [1, 2, 0], [math.nan] * 3, [1, 2, math.nan]])
     points_uv, z = displace(**arguments)
-    twins_uv, twins_z = reference.displace(**arguments)
+    expected_uv, expected_z = reference.displace(**arguments)
     assert not points_uv[0, :4].isfinite().any() and points_uv[0, 4:].isfinite().all()
     assert z[0, :2].tolist() == [0, 0] and z[0, 2:4].isnan().all() and z[0, 4:].isfinite().all()
-    torch.testing.assert_close((points_uv, z), (twins_uv, twins_z), equal_nan=True)
-    loss, twins_loss = 2 * points_uv.sum() + 3 * z.sum(), 2 * twins_uv.sum() + 3 * twins_z.sum()
+    torch.testing.assert_close((points_uv, z), (expected_uv, expected_z), equal_nan=True)
+    loss, expected_loss = 2 * points_uv.sum() + 3 * z.sum(), 2 * expected_uv.sum() + 3 * expected_z.sum()
     (grad,) = torch.autograd.grad(loss, arguments["points_xyz"])
-    (truth,) = torch.autograd.grad(twins_loss, arguments["points_xyz"])
+    (truth,) = torch.autograd.grad(expected_loss, arguments["points_xyz"])
     torch.testing.assert_close(grad, truth)
     assert grad[0, :4].tolist() == [[0, 0, 3]] * 4
 

@@ -1,4 +1,4 @@
-"""vestcl.ops.rigid_flow against its twin and by hand."""
+"""vestcl.ops.rigid_flow against the reference implementation and by hand."""
 
 import hashlib
 import math
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tolerances import assert_close, assert_like_twin
+from tolerances import assert_close, assert_like_reference
 from torch.autograd import gradcheck
 
 from vestcl import geometry, opencl, reference
@@ -38,8 +38,8 @@ def test_by_hand(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize(("batch", "count"), [(1, 1), (3, 100), (2, 5000)])
-def test_like_twin(mapped_session: opencl.Session, dtype: torch.dtype, batch: int, count: int) -> None:
-    assert_like_twin(rigid_flow, reference.rigid_flow, **scene(batch, count, dtype))
+def test_like_reference(mapped_session: opencl.Session, dtype: torch.dtype, batch: int, count: int) -> None:
+    assert_like_reference(rigid_flow, reference.rigid_flow, **scene(batch, count, dtype))
 
 
 def test_sums_keep_float32_over_many_points(mapped_session: opencl.Session) -> None:
@@ -81,7 +81,7 @@ def test_zero_quaternion(session: opencl.Session, dtype: torch.dtype) -> None:
 def test_only_the_gradients_asked_for(session: opencl.Session, asked: str) -> None:
     arguments = {name: value.detach() for name, value in scene(2, 50, torch.float32).items()}
     arguments[asked].requires_grad_()
-    assert_like_twin(rigid_flow, reference.rigid_flow, **arguments)
+    assert_like_reference(rigid_flow, reference.rigid_flow, **arguments)
     displacement_xyz = rigid_flow(**arguments)
     with session.profile() as times:
         displacement_xyz.sum().backward()
@@ -135,11 +135,11 @@ def test_points_that_are_not_finite_touch_nothing_else(mapped_session: opencl.Se
     with torch.no_grad():
         arguments["points_xyz"][1, 7, 2] = bad
     displacement_xyz = rigid_flow(**arguments)
-    twins = reference.rigid_flow(**arguments)
+    expected = reference.rigid_flow(**arguments)
     assert displacement_xyz.isnan().nonzero().tolist() == [[1, 7, 0], [1, 7, 1], [1, 7, 2]]
-    assert torch.equal(displacement_xyz.isnan(), twins.isnan())
+    assert torch.equal(displacement_xyz.isnan(), expected.isnan())
     grads = torch.autograd.grad(displacement_xyz.sum(), list(arguments.values()))
-    truths = torch.autograd.grad(twins.sum(), list(arguments.values()))
+    truths = torch.autograd.grad(expected.sum(), list(arguments.values()))
     for grad, truth in zip(grads, truths, strict=True):
         assert grad.isfinite().all()
         torch.testing.assert_close(grad, truth, rtol=1e-5, atol=1e-4)

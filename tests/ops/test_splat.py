@@ -1,11 +1,11 @@
-"""vestcl.ops.splat against its twin and by hand. What is extreme is in test_splat_stress.py."""
+"""vestcl.ops.splat against the reference implementation and by hand. What is extreme is in test_splat_stress.py."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tolerances import assert_close, assert_like_twin
+from tolerances import assert_close, assert_like_reference
 from torch.autograd import gradcheck
 
 from vestcl import opencl, reference
@@ -115,27 +115,27 @@ def test_min_transmittance_by_hand(mapped_session: opencl.Session) -> None:
     [(n, torch.float32) for n in (1, 2, 3, 4, 5, 16, 32, 37, 64, 256)] + [(n, torch.float64) for n in (1, 5, 16, 37)],
     indirect=["dtype"],
 )
-def test_like_twin(mapped_session: opencl.Session, dtype: torch.dtype, channels: int) -> None:
+def test_like_reference(mapped_session: opencl.Session, dtype: torch.dtype, channels: int) -> None:
     arguments = scene(2, 120, channels, dtype)
-    assert_like_twin(splat, reference.splat, **arguments)
+    assert_like_reference(splat, reference.splat, **arguments)
     image, coverage = splat(**arguments)
     assert (image.shape, coverage.shape) == ((2, channels, 20, 37), (2, 1, 20, 37))
     assert image.is_contiguous(memory_format=torch.channels_last) and coverage.is_contiguous()
 
 
 @pytest.mark.parametrize("min_transmittance", [0.02, 0.3])
-def test_truncated_like_twin(mapped_session: opencl.Session, dtype: torch.dtype, min_transmittance: float) -> None:
-    assert_like_twin(splat, reference.splat, **scene(2, 400, 3, dtype), min_transmittance=min_transmittance)
+def test_truncated_like_reference(mapped_session: opencl.Session, dtype: torch.dtype, min_transmittance: float) -> None:
+    assert_like_reference(splat, reference.splat, **scene(2, 400, 3, dtype), min_transmittance=min_transmittance)
 
 
 @pytest.mark.parametrize("output", [0, 1])
-def test_gradient_of_one_output_alone(mapped_session: opencl.Session, output: int) -> None:
+def test_gradient_of_one_output_only(mapped_session: opencl.Session, output: int) -> None:
     arguments = scene(2, 50, 3)
-    if output == 1:  # the twin's coverage does not depend on these, the operator's gradient of them is 0
+    if output == 1:  # the reference's coverage does not depend on these, the operator's gradient of them is 0
         grads = torch.autograd.grad(splat(**arguments)[1].sum(), [arguments[name] for name in INPUTS])
         assert not grads[3].any() and not grads[4].any() and all(grad.any() for grad in grads[:3])
         arguments |= {name: arguments[name].detach() for name in ("features", "backgrounds")}
-    assert_like_twin(lambda **a: splat(**a)[output], lambda **a: reference.splat(**a)[output], **arguments)
+    assert_like_reference(lambda **a: splat(**a)[output], lambda **a: reference.splat(**a)[output], **arguments)
 
 
 @pytest.mark.parametrize("asked", INPUTS)
@@ -153,7 +153,7 @@ def test_only_the_gradient_asked_for(
         return plain(file, name, defines)
 
     monkeypatch.setattr(mapped_session, "kernel", kernel)
-    assert_like_twin(lambda **a: splat(**a)[0], lambda **a: reference.splat(**a)[0], **arguments)
+    assert_like_reference(lambda **a: splat(**a)[0], lambda **a: reference.splat(**a)[0], **arguments)
     backward = [defines for defines in built if "GRAD_FEATURES" in defines]
     assert backward and all({n for n in INPUTS if d[f"GRAD_{n.upper()}"]} == {asked} for d in backward)
 
@@ -189,7 +189,7 @@ def test_numpy_in_numpy_out(mapped_session: opencl.Session, dtype: torch.dtype) 
         assert isinstance(array, np.ndarray) and np.array_equal(array, tensor.numpy())
 
 
-@pytest.mark.parametrize("nothing", ["no clouds", "no points", "all behind the camera", "all beside the image"])
+@pytest.mark.parametrize("nothing", ["no clouds", "no points", "all behind the camera", "all next to the image"])
 def test_nothing_to_draw(mapped_session: opencl.Session, nothing: str) -> None:
     arguments = detached(scene(2, 5, 3))
     if nothing == "no clouds":
@@ -211,19 +211,19 @@ def test_nothing_to_draw(mapped_session: opencl.Session, nothing: str) -> None:
 
 
 @pytest.mark.parametrize("counts", [[30, 0, 12], [0, 0, 1], [42], [0]])
-def test_packed_clouds_are_the_clouds_alone(mapped_session: opencl.Session, counts: list[int]) -> None:
+def test_packed_clouds_are_the_single_clouds(mapped_session: opencl.Session, counts: list[int]) -> None:
     clouds = [scene(1, count, 5) for count in counts]
-    alone = [all_of(cloud) for cloud in clouds]
+    single = [all_of(cloud) for cloud in clouds]
     packed = {name: torch.cat([cloud[name][0] for cloud in clouds]).detach() for name in ("z", *INPUTS[:4])}
     packed |= {"backgrounds": torch.cat([cloud["backgrounds"] for cloud in clouds]).detach()}
     for name in INPUTS:
         packed[name].requires_grad_()
     starts = torch.tensor([0, *np.cumsum(counts)])
     arguments: Scene = packed | {"height": 20, "width": 37, "cloud_starts": starts}
-    assert_like_twin(splat, reference.splat, **arguments)
+    assert_like_reference(splat, reference.splat, **arguments)
     image, coverage = splat(**arguments)
-    for b, (image_alone, coverage_alone, *_) in enumerate(alone):
-        assert torch.equal(image[b], image_alone[0]) and torch.equal(coverage[b], coverage_alone[0])
+    for b, (single_image, single_coverage, *_) in enumerate(single):
+        assert torch.equal(image[b], single_image[0]) and torch.equal(coverage[b], single_coverage[0])
 
 
 def test_two_feature_sets_on_one_geometry(mapped_session: opencl.Session) -> None:

@@ -48,7 +48,7 @@ def test_twice(mapped_session: opencl.Session, channels: int) -> None:
 
 def test_any_number_of_threads(session: opencl.Session) -> None:
     if "PoCL" not in session.info.version or session.info.kind != "CPU":
-        pytest.skip("only PoCL on a CPU can be told how many threads to use")
+        pytest.skip("only PoCL on a CPU can be given a number of threads to use")
     here = Path(__file__).resolve().parent
     path = {
         "PYTHONPATH": os.pathsep.join([str(here), str(here.parents[1]), str(here.parent / "support")]),
@@ -78,12 +78,12 @@ def test_counters_are_bounded_on_any_number_of_units(
 ) -> None:
     """Of a CPU with 100,000 units, too; and no result depends on how many chunks there are."""
     counters = 3 * 6
-    usual = bits(5)
+    reference = bits(5)
     monkeypatch.setattr(mapped_session, "info", dataclasses.replace(mapped_session.info, compute_units=100_000))
     monkeypatch.setattr(_splat_lists, "MAX_COUNTERS", most)
     chunks = _splat_lists.chunks_of(mapped_session, 10**9, counters)
     assert chunks >= 1 and (chunks == 1 or chunks * counters <= most)
-    assert bits(5) == usual
+    assert bits(5) == reference
 
 
 @pytest.mark.parametrize("pattern", [0x00, 0xFF, 0x3F])  # zeros, NaN or -1, and harmless looking numbers
@@ -106,10 +106,10 @@ def test_whatever_memory_held_before(
         scratches.append(count)
         return job.write(empty((max(1, count) * np.dtype(dtype).itemsize,), np.uint8))
 
-    usual, filled, scratches = (bits(5), bits(16)), [], []
+    reference, filled, scratches = (bits(5), bits(16)), [], []
     monkeypatch.setattr(opencl.Job, "scratch", scratch)
     monkeypatch.setattr(host_memory, "empty", empty)
-    assert (bits(5), bits(16)) == usual
+    assert (bits(5), bits(16)) == reference
     assert len(filled) > 10 and scratches
 
 

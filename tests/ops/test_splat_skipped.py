@@ -1,4 +1,4 @@
-"""What vestcl.ops.splat skips: counted by hand and against the twin, and without a trace in image and gradients."""
+"""What vestcl.ops.splat skips: counted by hand and against the reference, without a trace in image and gradients."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from test_splat import Scene, all_of, detached, pile, scene
-from tolerances import assert_like_twin
+from tolerances import assert_like_reference
 
 from vestcl import constants, opencl, reference
 from vestcl.ops.splat import Skipped, composite, rasterize, skipped, splat
@@ -56,7 +56,7 @@ def test_each_reason_by_hand(mapped_session: opencl.Session, dtype: torch.dtype)
 
 
 @pytest.mark.parametrize("min_transmittance", [0.0, 0.3])
-def test_like_the_twin(mapped_session: opencl.Session, dtype: torch.dtype, min_transmittance: float) -> None:
+def test_like_the_reference(mapped_session: opencl.Session, dtype: torch.dtype, min_transmittance: float) -> None:
     torch.manual_seed(5)
     arguments = scene(2, 400, 1, dtype)
     counted = skipped(rasterized(arguments), min_transmittance)
@@ -107,7 +107,7 @@ def test_opacity_zero_has_its_gradient(mapped_session: opencl.Session) -> None:
     with torch.no_grad():
         arguments["opacities"][:, ::3] = 0
     assert skipped(rasterized(arguments)).transparent == 0
-    assert_like_twin(splat, reference.splat, **arguments)
+    assert_like_reference(splat, reference.splat, **arguments)
 
 
 def test_opacities_that_require_grad_too_late(session: opencl.Session) -> None:
@@ -120,11 +120,11 @@ def test_opacities_that_require_grad_too_late(session: opencl.Session) -> None:
 
 @pytest.mark.parametrize("min_transmittance", [0.0, 0.01])
 def test_behind_opaque_layers(mapped_session: opencl.Session, min_transmittance: float) -> None:
-    """400 points on each of 4 x 4 pixels, the 100th opaque: the walk stops long before the list ends."""
+    """400 points on each of 4 x 4 pixels, the 100th opaque: the traversal stops long before the list ends."""
     torch.manual_seed(6)
     arguments = layers([0.01] * 99 + [1.0] + [0.5] * 300, 4)
     assert skipped(rasterized(arguments), min_transmittance).saturated_pixels == 16
-    assert_like_twin(splat, reference.splat, **arguments, min_transmittance=min_transmittance)
+    assert_like_reference(splat, reference.splat, **arguments, min_transmittance=min_transmittance)
     hidden = all_of(arguments)[2:-1]
     for grad in hidden:
         assert not grad.reshape(-1, *grad.shape[2:])[100 * 16 :].any()
@@ -147,4 +147,4 @@ def test_behind_a_wall_across_tiles(mapped_session: opencl.Session, min_transmit
     for name, more in behind.items():
         both = torch.cat([arguments[name].detach()[wall][None], more], 1)
         arguments[name] = both if name == "z" else both.requires_grad_()
-    assert_like_twin(splat, reference.splat, **arguments, min_transmittance=min_transmittance)
+    assert_like_reference(splat, reference.splat, **arguments, min_transmittance=min_transmittance)

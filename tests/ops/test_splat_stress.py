@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from test_splat import INPUTS, Scene, all_of, assert_same_bits, detached, pile, scene
-from tolerances import assert_close, assert_like_twin
+from tolerances import assert_close, assert_like_reference
 
 from vestcl import opencl, reference
 from vestcl.ops.splat import splat
@@ -75,7 +75,7 @@ def test_a_thousand_layers(
     with torch.no_grad():
         arguments["radii"] += 8
         arguments["opacities"].uniform_(*opacities)
-    assert_like_twin(splat, reference.splat, **arguments)
+    assert_like_reference(splat, reference.splat, **arguments)
 
 
 def test_a_million_points_in_one_tile(mapped_session: opencl.Session, long_lists: None) -> None:
@@ -120,7 +120,7 @@ def spread(depths: str, count: int, dtype: torch.dtype) -> torch.Tensor:
 @pytest.mark.parametrize("count", [20, 700])
 def test_any_depths_in_order(mapped_session: opencl.Session, dtype: torch.dtype, depths: str, count: int) -> None:
     arguments = crowd(count, dtype=dtype) | {"z": spread(depths, count, dtype)}
-    assert_like_twin(splat, reference.splat, **arguments)
+    assert_like_reference(splat, reference.splat, **arguments)
 
 
 # ---------------------------------------------------------------- sizes
@@ -129,7 +129,7 @@ def test_any_depths_in_order(mapped_session: opencl.Session, dtype: torch.dtype,
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 50), (33, 1), (16, 16), (17, 15), (32, 64)])
 def test_image_sizes(mapped_session: opencl.Session, height: int, width: int) -> None:
     arguments = scene(2, 90, 3) | {"height": height, "width": width, "backgrounds": None}
-    assert_like_twin(splat, reference.splat, **arguments)
+    assert_like_reference(splat, reference.splat, **arguments)
 
 
 @pytest.mark.parametrize("min_transmittance", [0.0, 0.2])
@@ -141,7 +141,7 @@ def test_footprints_over_many_tiles(
     with torch.no_grad():
         arguments["points_uv"] *= 3.5
         arguments["radii"] *= 12
-    assert_like_twin(splat, reference.splat, **arguments, min_transmittance=min_transmittance)
+    assert_like_reference(splat, reference.splat, **arguments, min_transmittance=min_transmittance)
 
 
 def test_a_footprint_ends_where_the_distance_is_the_radius(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
@@ -159,7 +159,7 @@ def test_radii(mapped_session: opencl.Session, radius: float) -> None:
     with torch.no_grad():
         arguments["radii"][:, ::3] = radius
         arguments["opacities"][:, ::3] *= 0.2
-    assert_like_twin(splat, reference.splat, **arguments)
+    assert_like_reference(splat, reference.splat, **arguments)
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_opacity_0_has_a_gradient(mapped_session: opencl.Session, dtype: torch.d
     arguments = crowd(60, dtype=dtype)
     with torch.no_grad():
         arguments["opacities"][0, ::2] = 0
-    assert_like_twin(splat, reference.splat, **arguments)
+    assert_like_reference(splat, reference.splat, **arguments)
     with torch.no_grad():
         arguments["opacities"].zero_()
         arguments["radii"] += 1
@@ -241,7 +241,7 @@ def test_opacities_outside_0_to_1_are_used_as_they_stand(mapped_session: opencl.
     arguments = scene(1, 60, 3)
     with torch.no_grad():
         arguments["opacities"] *= torch.randn(1, 60)
-    assert_like_twin(splat, reference.splat, **arguments)
+    assert_like_reference(splat, reference.splat, **arguments)
 
 
 @pytest.mark.parametrize("min_transmittance", [0.5, 0.01, 1e-4])
@@ -273,8 +273,8 @@ def scenes(draw: st.DrawFn) -> Scene:
     last = {"points_uv": (2,), "features": (channels,)}
     values: Scene = {"height": draw(st.integers(1, 40)), "width": draw(st.integers(1, 40))}
     for name, (low, high) in RANGES.items():
-        usual = st.integers(low * STEPS, high * STEPS).map(lambda n: n / STEPS)
-        numbers = draw(st.sampled_from([usual, usual, st.one_of(usual, st.sampled_from(ODD[name]))]))
+        common = st.integers(low * STEPS, high * STEPS).map(lambda n: n / STEPS)
+        numbers = draw(st.sampled_from([common, common, st.one_of(common, st.sampled_from(ODD[name]))]))
         shape = (batch, count, *last.get(name, ()))
         values[name] = torch.from_numpy(draw(arrays(np.float64, shape, elements=numbers, fill=st.nothing())))
     return recording(values | {"backgrounds": torch.linspace(-1, 1, batch * channels).double().reshape(batch, -1)})
@@ -287,10 +287,10 @@ def scenes(draw: st.DrawFn) -> Scene:
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 @given(arguments=scenes())
-def test_any_scene_like_twin(mapped_session: opencl.Session, float64: torch.dtype, arguments: Scene) -> None:
-    (image, coverage), (twins_image, twins_coverage) = splat(**arguments), reference.splat(**arguments)
+def test_any_scene_like_reference(mapped_session: opencl.Session, float64: torch.dtype, arguments: Scene) -> None:
+    (image, coverage), (expected_image, expected_coverage) = splat(**arguments), reference.splat(**arguments)
     inputs = [arguments[name] for name in INPUTS]
     grads = torch.autograd.grad(image.square().sum() + coverage.sum(), inputs)
-    twins = torch.autograd.grad(twins_image.square().sum() + twins_coverage.sum(), inputs)
-    for got, wanted in zip((image, coverage, *grads), (twins_image, twins_coverage, *twins), strict=True):
+    expected = torch.autograd.grad(expected_image.square().sum() + expected_coverage.sum(), inputs)
+    for got, wanted in zip((image, coverage, *grads), (expected_image, expected_coverage, *expected), strict=True):
         torch.testing.assert_close(got, wanted, rtol=1e-9, atol=1e-9)

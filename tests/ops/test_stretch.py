@@ -1,16 +1,16 @@
-"""vestcl.ops.stretch against its twin and by hand."""
+"""vestcl.ops.stretch against the reference implementation and by hand."""
 
 import numpy as np
 import pytest
 import torch
-from tolerances import assert_like_twin
+from tolerances import assert_like_reference
 
 from vestcl import constants, opencl, reference
 from vestcl.ops.stretch import stretch
 
 
 def warped(batch: int, height: int, width: int, dtype: torch.dtype) -> torch.Tensor:
-    """[B, H, W, 2] px: a picture whose right half moved away, below it a row that left, and steps of 1 to 2 px."""
+    """[B, H, W, 2] px: an image whose right half moved away, below it a row that left, and steps of 1 to 2 px."""
     steps = 1 + torch.rand(2, batch, height, width, dtype=dtype)
     points_uv = torch.stack([steps[0].cumsum(2), steps[1].cumsum(1)], dim=3)
     points_uv[:, :, width // 2 :, 0] += 30
@@ -19,9 +19,9 @@ def warped(batch: int, height: int, width: int, dtype: torch.dtype) -> torch.Ten
 
 
 @pytest.mark.parametrize("size", [(1, 1, 1), (2, 1, 9), (2, 9, 1), (3, 11, 17), (1, 3, 5000)])
-def test_like_twin(mapped_session: opencl.Session, dtype: torch.dtype, size: tuple[int, int, int]) -> None:
+def test_like_reference(mapped_session: opencl.Session, dtype: torch.dtype, size: tuple[int, int, int]) -> None:
     magnified = 0.4 + 1.2 * torch.rand(size, dtype=dtype)
-    assert_like_twin(stretch, reference.stretch, points_uv=warped(*size, dtype), magnified=magnified)
+    assert_like_reference(stretch, reference.stretch, points_uv=warped(*size, dtype), magnified=magnified)
 
 
 def test_by_hand(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
@@ -47,7 +47,7 @@ def test_what_is_not_finite_is_nobodys_neighbour(
     points_uv = warped(1, 4, 4, dtype)
     points_uv[0, 1, 1, 0] = bad
     magnified = torch.ones(1, 4, 4, dtype=dtype)
-    assert_like_twin(stretch, reference.stretch, points_uv=points_uv, magnified=magnified)
+    assert_like_reference(stretch, reference.stretch, points_uv=points_uv, magnified=magnified)
     assert stretch(points_uv, magnified)[1][0, 1, 1] == 0
 
 
@@ -83,7 +83,7 @@ def test_a_plane_along_the_motion_stays_whole_close_to_the_camera(
     points_uv[:, 31:, :, 1] += 60  # a jump: what is next to it has neighbours at one side
     opacity = stretch(points_uv, magnified[None, :, None])[1][0, 1:-1, 0]
     assert opacity.nonzero()[:, 0].tolist() == [i for i in range(38) if i not in (29, 30)]
-    assert_like_twin(stretch, reference.stretch, points_uv=points_uv, magnified=magnified[None, :, None])
+    assert_like_reference(stretch, reference.stretch, points_uv=points_uv, magnified=magnified[None, :, None])
 
 
 def test_rows_of_a_road_are_no_farther_apart_at_its_sides(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
@@ -93,4 +93,4 @@ def test_rows_of_a_road_are_no_farther_apart_at_its_sides(mapped_session: opencl
     factor, opacity = stretch(points_uv, magnified[None])
     assert opacity[0, 1:-1].all()
     torch.testing.assert_close(factor[0, 1:-1, 1:-1], magnified[1:-1, 1:-1], rtol=0.02, atol=0)
-    assert_like_twin(stretch, reference.stretch, points_uv=points_uv, magnified=magnified[None].contiguous())
+    assert_like_reference(stretch, reference.stretch, points_uv=points_uv, magnified=magnified[None].contiguous())

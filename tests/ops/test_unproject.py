@@ -1,11 +1,11 @@
-"""vestcl.ops.unproject against its twin and by hand."""
+"""vestcl.ops.unproject against the reference implementation and by hand."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tolerances import assert_close, assert_like_twin
+from tolerances import assert_close, assert_like_reference
 from torch.autograd import gradcheck
 
 from vestcl import opencl, reference
@@ -29,9 +29,11 @@ def test_by_hand(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize(("batch", "height", "width"), [(1, 1, 1), (3, 11, 17), (2, 2, 5000)])
-def test_like_twin(mapped_session: opencl.Session, dtype: torch.dtype, batch: int, height: int, width: int) -> None:
+def test_like_reference(
+    mapped_session: opencl.Session, dtype: torch.dtype, batch: int, height: int, width: int
+) -> None:
     depth, K = depth_map(batch, height, width, dtype), camera(batch, dtype)
-    assert_like_twin(unproject, reference.unproject, depth=depth, K=K)
+    assert_like_reference(unproject, reference.unproject, depth=depth, K=K)
 
 
 def test_gradcheck(mapped_session: opencl.Session, float64: torch.dtype) -> None:

@@ -8,7 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from prepare_scenes import COMMAND, FRAMES, HEIGHT, ROOT, SMALL, WIDTH, contents, options, run, told, until, write_drive
+from prepare_scenes import (
+    COMMAND,
+    FRAMES,
+    HEIGHT,
+    ROOT,
+    SMALL,
+    WIDTH,
+    contents,
+    options,
+    run,
+    settings_for,
+    until,
+    write_drive,
+)
 
 from vestcl.cli import prepare as prepare_command
 from vestcl.data import calibration
@@ -114,20 +127,20 @@ def test_a_video_counts_by_its_content(tmp_path: Path) -> None:
 
 
 def test_files_count_by_their_content(folder: Path, tmp_path: Path) -> None:
-    before = frame_keys(prepare_command.open_input(str(folder), told(folder)))
+    before = frame_keys(prepare_command.open_input(str(folder), settings_for(folder)))
     moved = folder.rename(tmp_path / "elsewhere")
-    assert frame_keys(prepare_command.open_input(str(moved), told(moved))) == before
+    assert frame_keys(prepare_command.open_input(str(moved), settings_for(moved))) == before
     for what in ("image", "metres", "classes"):
         path = max((moved / what).iterdir())
         pixels = read_pixels(path)
         pixels[3, 5] ^= 1
         write_pixels(path, pixels)
-        after = frame_keys(prepare_command.open_input(str(moved), told(moved)))
+        after = frame_keys(prepare_command.open_input(str(moved), settings_for(moved)))
         assert differ(before, after) == [FRAMES - 1]
         before = after
 
 
-def test_no_frame_is_computed_from_more_than_its_key_tells(folder: Path) -> None:
+def test_no_frame_is_computed_from_more_than_its_key_covers(folder: Path) -> None:
     """A monocular clip is where perception looks furthest."""
     clip = prepare_command.open_input(str(folder), options())
     for index in range(FRAMES + 2):
@@ -178,19 +191,21 @@ def test_deleted_truncated_and_damaged_frames_are_computed_again(
     assert contents(tmp_path) == before
 
 
-def test_changed_files_are_computed_again_beside_the_data_set(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(told(folder), capsys) == (FRAMES, 0)
+def test_changed_files_are_computed_again_next_to_the_data_set(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(settings_for(folder), capsys) == (FRAMES, 0)
     (clip,) = find_prepared(folder)
     assert clip.folder == folder / ".vestcl" / f"drive-{HEIGHT}x{WIDTH}" and clip.kind == "folder"
     path = max((folder / "image").iterdir())
     write_pixels(path, read_pixels(path)[::-1])
-    assert run(told(folder), capsys) == (1, FRAMES - 1)
+    assert run(settings_for(folder), capsys) == (1, FRAMES - 1)
     np.testing.assert_array_equal(to_pixels(PreparedClip.open(clip.folder).image(FRAMES - 1)), read_pixels(path))
-    with pytest.raises(ValueError, match=r"was computed from other frames than clip.json tells"):
+    with pytest.raises(ValueError, match=r"was computed from other frames than clip.json lists"):
         clip.image(FRAMES - 1)  # as it was opened before
 
 
-def test_killed_at_any_moment_it_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_killed_at_any_moment_it_continues(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = options("street:5", out=tmp_path / "cache")
     folder = tmp_path / "cache" / f"street_5-{HEIGHT}x{WIDTH}"
     for wanted in (1, 3):  # frames that are there when it is killed

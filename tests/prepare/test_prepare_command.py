@@ -24,7 +24,7 @@ def folder(tmp_path: Path) -> Path:
     return write_drive(tmp_path / "drive")
 
 
-def test_estimators_are_told_apart_by_name_or_files(tmp_path: Path) -> None:
+def test_estimators_are_distinguished_by_name_or_files(tmp_path: Path) -> None:
     weights = write_text(tmp_path / "network" / "weights", "12")
     networks: tuple[dict[str, str], ...] = ({}, {"depth_model": "a/b"}, {"mask_model": "a/b"}, {"depth_model": "a/c"})
     names = [prepare_command.estimators(options(**network)) for network in networks]
@@ -34,7 +34,7 @@ def test_estimators_are_told_apart_by_name_or_files(tmp_path: Path) -> None:
     assert len(set(names)) == 6 and names[0] == ""
 
 
-def test_onnx_files_are_told_apart_with_their_description(tmp_path: Path) -> None:
+def test_onnx_files_are_distinguished_with_their_description(tmp_path: Path) -> None:
     file = write_mix(tmp_path / "network.onnx", [[1.0, 0.0, 0.0]])
     keys = [prepare_command.estimators(options(depth_model=str(file)))]
     for text in ('{"metres": 2}', '{"metres": 33}'):
@@ -59,7 +59,7 @@ def test_shards_part_the_clips() -> None:
     assert texts(7, 8) == []
 
 
-def test_the_shard_is_told_or_torchruns() -> None:
+def test_the_shard_is_given_or_torchruns() -> None:
     torchrun = {"RANK": "2", "WORLD_SIZE": "4"}
     assert prepare_command.shard(None, {}) == (0, 1)
     assert prepare_command.shard(None, {"RANK": "2"}) == (0, 1)
@@ -83,17 +83,17 @@ def test_torchruns_ranks_share_the_work(
 
 
 def test_random_driving() -> None:
-    usual = prepare_command.open_input("street:5", options())
+    default = prepare_command.open_input("street:5", options())
     drawn, again, other = (prepare_command.open_input(f"street:{i}", options(drive="random")) for i in (5, 5, 6))
-    assert usual.name == drawn.name == "street 5"
-    assert usual[0].timestamp == 0
+    assert default.name == drawn.name == "street 5"
+    assert default[0].timestamp == 0
     starts = [clip[0].timestamp for clip in (drawn, again, other)]
     assert starts[0] == starts[1] != starts[2] and all(0 < start < 60 for start in starts if start is not None)
-    poses = [np.array([sample.world_from_cam for sample in clip], np.float64) for clip in (usual, drawn, again)]
+    poses = [np.array([sample.world_from_cam for sample in clip], np.float64) for clip in (default, drawn, again)]
     speeds = [np.linalg.norm(pose[1, :3, 3] - pose[0, :3, 3]) for pose in poses]
     assert speeds[1] == speeds[2] != speeds[0]
     assert frame_keys(drawn) == frame_keys(again)
-    assert not set(frame_keys(drawn)) & set(frame_keys(usual))
+    assert not set(frame_keys(drawn)) & set(frame_keys(default))
 
 
 def test_streets_without_their_depth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -125,9 +125,9 @@ def test_errors(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
     out = ("--out", str(tmp_path / "cache"))
     file = write_text(tmp_path / "file", "")
-    assert error("street:5") == "error: street:5: is no folder to keep a cache in; `--out` must name one"
+    assert error("street:5") == "error: street:5: is not a folder to keep a cache in; `--out` must name one"
     assert error(str(tmp_path / "nowhere"), *out).endswith("nowhere: no such file or folder")
-    assert "is no clip that vestcl knows" in error(str(tmp_path), *out)
+    assert "unrecognised dataset layout" in error(str(tmp_path), *out)
     assert error("street:7-5", *out).endswith("must have streets from a lower to a higher seed, got street:7-5")
     assert error("street:5", *out, "--rig", "grey").endswith("it does not take --rig")
     assert error("street:5", *out, "--mask-model", "x").endswith("it does not take --mask-model")
@@ -149,7 +149,7 @@ def test_one_clips_failure_stops_no_other(folder: Path, tmp_path: Path, capsys: 
     write_pixels(lonely / "image" / "0.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     write_text(lonely / "camera.json", (folder / "camera.json").read_text())
     plain = options(str(lonely), str(folder), "street:5", out=tmp_path / "cache")
-    with pytest.raises(ValueError, match=r"lonely: must have 2 frames or more, got 1.*\n.*is no image"):
+    with pytest.raises(ValueError, match=r"lonely: must have 2 frames or more, got 1.*\n.*is not an image"):
         prepare_command.run(plain)
     assert counted(capsys.readouterr().out.rpartition("stage")[2]) == (FRAMES, 0)
     assert [clip.name for clip in find_prepared(tmp_path / "cache")] == ["street 5"]

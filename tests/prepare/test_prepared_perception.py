@@ -53,7 +53,7 @@ def test_nothing_is_preprocessed_again(street: Clip, sequence: PreparedSequence)
         seen, original = perception.seen(index), wanted.seen(index)
         assert np.array_equal(seen.layers.depth, original.layers.depth)
         assert np.array_equal(seen.layers.mask, original.layers.mask)
-        assert np.array_equal(perception.moving(index).things, wanted.moving(index).things)
+        assert np.array_equal(perception.moving(index).instances, wanted.moving(index).instances)
         assert np.array_equal(perception.mask(index), original.layers.mask)
         assert np.array_equal(perception.raw_depth(index), original.layers.depth)
         assert np.array_equal(perception.prev_from_cur(index), wanted.prev_from_cur(index))
@@ -66,7 +66,7 @@ def test_nothing_is_preprocessed_again(street: Clip, sequence: PreparedSequence)
         assert np.abs(made[view].image - original_made[view].image).mean() < 0.002
 
 
-def test_the_right_camera_is_for_judging_alone(sequence: PreparedSequence) -> None:
+def test_the_right_camera_is_for_judging_only(sequence: PreparedSequence) -> None:
     """The learned baseline sees the clip's frames again: with their depth, not with their pairs."""
     perception = PreparedPerception(sequence)
     assert all(sample.right is None for sample in perception.clip)
@@ -80,13 +80,13 @@ def test_the_right_camera_is_for_judging_alone(sequence: PreparedSequence) -> No
 def test_a_cache_lists_its_inputs(sequence: PreparedSequence, street: Clip, tmp_path: Path) -> None:
     assert sequence.prepared is not None
     assert sequence.prepared.inputs == Inputs("the street itself, true", "labels", "optical flow and depth", "regions")
-    told = Inputs("the estimator a", "the classes of b", "optical flow and depth", "lama:c")
-    prepare_clip(street[:2], tmp_path, told)
-    assert PreparedClip.open(tmp_path).inputs == told
+    settings = Inputs("the estimator a", "the classes of b", "optical flow and depth", "lama:c")
+    prepare_clip(street[:2], tmp_path, settings)
+    assert PreparedClip.open(tmp_path).inputs == settings
     text = (tmp_path / "clip.json").read_text().replace('"stereo": false', '"stereo": "no"')
     (tmp_path / "clip.json").write_text(text)
     with pytest.raises(ValueError, match="is damaged"):
         PreparedClip.open(tmp_path)
-    for wrong in ({"depth": "a"}, {**told.as_entries(), "stereo": 1}, None):
+    for wrong in ({"depth": "a"}, {**settings.as_entries(), "stereo": 1}, None):
         with pytest.raises(ValueError, match="`inputs` must have depth, masks, motion, inpainting, stereo, got"):
             Inputs.read(wrong)

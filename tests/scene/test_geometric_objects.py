@@ -1,4 +1,4 @@
-"""vestcl.scene.motion.objects: foreground cut into things, and the velocity of each."""
+"""vestcl.scene.motion.objects: foreground cut into objects, and the velocity of each."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ INVERSE_STD = 0.002
 
 PREV_FROM_CUR = turned(0.01, -0.004, 0.002, (0.03, -0.01, 0.9))
 
-#: Where the thing is, and how far, metres.
+#: Where the object is, and how far, metres.
 BOX, BOX_DEPTH = np.s_[35:65, 100:150], 10.0
 
 NOTHING = np.zeros((HEIGHT, WIDTH), np.int32)
@@ -39,10 +39,10 @@ def with_box(value: float, elsewhere: float = 40.0) -> Floats:
     return plane
 
 
-def the_thing() -> np.ndarray:
-    things = NOTHING.copy()
-    things[BOX] = 1
-    return things
+def the_object() -> np.ndarray:
+    instances = NOTHING.copy()
+    instances[BOX] = 1
+    return instances
 
 
 def seen_moving(v: tuple[float, float, float]) -> tuple[Correspondence, Floats]:
@@ -63,26 +63,26 @@ def measure(v: tuple[float, float, float], noise: float = 0.0, depth_prev: Float
     correspondence, before = seen_moving(v)
     before = before if depth_prev is None else depth_prev
     noisy = with_noise(correspondence, noise)
-    return velocities(the_thing(), with_box(BOX_DEPTH), before, INVERSE_STD, noisy, PREV_FROM_CUR, K)
+    return velocities(the_object(), with_box(BOX_DEPTH), before, INVERSE_STD, noisy, PREV_FROM_CUR, K)
 
 
-# ---------------------------------------------------------------- things
+# ---------------------------------------------------------------- objects
 
 
-def test_things_are_cut_where_depth_jumps() -> None:
+def test_objects_are_cut_where_depth_jumps() -> None:
     """Two boxes side by side, at 8 and 12 m, and a third apart from them."""
     mask, depth = np.ones((1, HEIGHT, WIDTH), bool), flat(40)
     for columns, metres in ((slice(100, 130), 8), (slice(130, 160), 12), (slice(200, 230), 12)):
         mask[:, 40:70, columns], depth[:, 40:70, columns] = False, metres
-    things = segment(mask, depth)
-    assert things.dtype == np.int32 and things.shape == (HEIGHT, WIDTH)
-    assert np.array_equal(things > 0, ~mask[0])  # those at a jump found their owner, and no one else did
-    first, second, third = (np.unique(things[40:70, a:b]) for a, b in ((100, 129), (132, 160), (200, 230)))
+    instances = segment(mask, depth)
+    assert instances.dtype == np.int32 and instances.shape == (HEIGHT, WIDTH)
+    assert np.array_equal(instances > 0, ~mask[0])  # those at a jump found their owner, and no one else did
+    first, second, third = (np.unique(instances[40:70, a:b]) for a, b in ((100, 129), (132, 160), (200, 230)))
     assert len(first) == len(second) == len(third) == 1
     assert sorted([first[0], second[0], third[0]]) == [1, 2, 3]
 
 
-def test_a_slope_is_one_thing() -> None:
+def test_a_slope_is_one_object() -> None:
     """A lorry along the road: 6 to 20 m."""
     mask, depth = np.ones((1, HEIGHT, WIDTH), bool), flat(40)
     mask[:, 40:70, 100:180] = False
@@ -90,33 +90,33 @@ def test_a_slope_is_one_thing() -> None:
     assert np.array_equal(segment(mask, depth) == 1, ~mask[0])
 
 
-def test_spray_between_two_things_goes_to_the_nearest() -> None:
+def test_spray_between_two_objects_goes_to_the_nearest() -> None:
     mask, depth = np.ones((1, HEIGHT, WIDTH), bool), flat(40)
     mask[:, 40:70, 100:160] = False
     depth[:, 40:70, 100:130], depth[:, 40:70, 130:160] = 8, 20
     depth[:, 40:70, 128:132] = np.random.default_rng(0).uniform(8, 20, (30, 4))
-    things = segment(mask, depth)
-    assert set(np.unique(things[40:70, 100:160])) == {1, 2}
-    assert (things[42:68, 128] == things[50, 110]).all() and (things[42:68, 131] == things[50, 150]).all()
+    instances = segment(mask, depth)
+    assert set(np.unique(instances[40:70, 100:160])) == {1, 2}
+    assert (instances[42:68, 128] == instances[50, 110]).all() and (instances[42:68, 131] == instances[50, 150]).all()
 
 
 def test_nothing_in_the_foreground() -> None:
     assert not segment(np.ones((1, HEIGHT, WIDTH), bool), flat(40)).any()
 
 
-def test_what_is_too_small_to_measure_is_no_thing() -> None:
+def test_what_is_too_small_to_measure_is_not_an_object() -> None:
     mask = np.ones((1, HEIGHT, WIDTH), bool)
     mask[:, 40:42, 100:102] = False
     assert not segment(mask, flat(40)).any()
 
 
-def test_what_is_too_small_to_measure_does_not_join_a_thing_elsewhere() -> None:
+def test_what_is_too_small_to_measure_does_not_join_an_object_elsewhere() -> None:
     """A distant sign keeps off the car's velocity, 60 pixels away."""
     mask, depth = np.ones((1, HEIGHT, WIDTH), bool), with_box(BOX_DEPTH)
     mask[0][BOX] = False
     mask[:, 40:42, 210:212] = False
-    things = segment(mask, depth)
-    assert np.array_equal(things == 1, the_thing() == 1)
+    instances = segment(mask, depth)
+    assert np.array_equal(instances == 1, the_object() == 1)
 
 
 # ---------------------------------------------------------------- velocities
@@ -130,8 +130,8 @@ def test_a_known_velocity_is_recovered(v: tuple[float, float, float]) -> None:
 
 
 @pytest.mark.parametrize("v", [(0.4, 0.0, 0.9), (-0.2, 0.05, -1.8)])
-def test_flow_alone_tells_it_too(v: tuple[float, float, float]) -> None:
-    """Without the depth before, how the thing grows tells how it comes nearer."""
+def test_flow_gives_it_too(v: tuple[float, float, float]) -> None:
+    """Without the depth before, how the object grows shows how it comes nearer."""
     np.testing.assert_allclose(measure(v, depth_prev=np.zeros_like(flat(1)))[1], v, atol=0.1)
 
 
@@ -140,20 +140,20 @@ def test_noise_and_outliers_do_not_carry_it_away() -> None:
     correspondence, before = seen_moving(v)
     noisy = with_noise(correspondence, 0.3)
     noisy.flow_uv[:, 35:65:5, 100:150] += 6  # one row in five
-    found = velocities(the_thing(), with_box(BOX_DEPTH), before, INVERSE_STD, noisy, PREV_FROM_CUR, K)
+    found = velocities(the_object(), with_box(BOX_DEPTH), before, INVERSE_STD, noisy, PREV_FROM_CUR, K)
     np.testing.assert_allclose(found[1], v, atol=0.15)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3])
-def test_what_stands_has_exactly_no_velocity(noise: float) -> None:
+def test_what_is_static_has_exactly_no_velocity(noise: float) -> None:
     assert not measure((0.0, 0.0, 0.0), noise).any()
 
 
-def test_what_stands_beside_what_moves() -> None:
+def test_static_next_to_dynamic_objects() -> None:
     correspondence, before = seen_moving((0.4, 0.0, 0.9))
-    things = the_thing()
-    things[40:60, 200:240] = 2
-    found = velocities(things, with_box(BOX_DEPTH), before, INVERSE_STD, correspondence, PREV_FROM_CUR, K)
+    instances = the_object()
+    instances[40:60, 200:240] = 2
+    found = velocities(instances, with_box(BOX_DEPTH), before, INVERSE_STD, correspondence, PREV_FROM_CUR, K)
     assert found.shape == (3, 3) and found[1].any() and not found[2].any()
 
 
@@ -163,10 +163,10 @@ def test_of_what_is_not_seen_nothing_is_said(why: str) -> None:
     depth = with_box(0.0 if why == "no depth" else BOX_DEPTH)
     if why == "flow does not return":
         correspondence.error[0][BOX] = np.inf
-    assert not velocities(the_thing(), depth, before, INVERSE_STD, correspondence, PREV_FROM_CUR, K).any()
+    assert not velocities(the_object(), depth, before, INVERSE_STD, correspondence, PREV_FROM_CUR, K).any()
 
 
-def test_no_things() -> None:
+def test_no_objects() -> None:
     found = velocities(NOTHING, flat(40), flat(40), INVERSE_STD, exact_flow(flat(40), pose()), pose(), K)
     assert found.shape == (1, 3) and not found.any()
 

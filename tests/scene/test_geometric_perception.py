@@ -72,15 +72,15 @@ def relative_error(depth: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def test_a_frame_of_the_street() -> None:
     clip = drive(4).clip
     perception, sample = Perception(clip), clip[FRAME]
-    seen, things = perception.seen(FRAME), perception.moving(FRAME).things
+    seen, instances = perception.seen(FRAME), perception.moving(FRAME).instances
     layers, labels = seen.layers, sample.read_labels()
     assert np.array_equal(layers.image, sample.read_image())
     assert np.array_equal(layers.mask, sample.read_mask()) and not seen.own.any()
     assert (layers.depth > 0).all() and (layers.background_depth >= layers.depth).all()
     assert (layers.depth[labels == 10] == SKY_DEPTH).all() and (labels == 10).any()
     assert np.median(relative_error(layers.depth, sample.read_depth())) < 0.01
-    assert things.shape == (HEIGHT, WIDTH) and things.max() > 3
-    assert not things[layers.mask[0]].any()
+    assert instances.shape == (HEIGHT, WIDTH) and instances.max() > 3
+    assert not instances[layers.mask[0]].any()
 
 
 def test_the_first_frame_has_no_motion() -> None:
@@ -129,7 +129,7 @@ def test_of_a_pair_depth_is_as_good_as_its_disparity() -> None:
 
 
 def test_without_labels_motion_makes_the_mask() -> None:
-    """Much of an oncoming car at 10 m is foreground, and little of what stands."""
+    """Much of an oncoming car at 10 m is foreground, and little of what is static."""
     passing = drive(0, start=1.3, samples=2)
     mask, moving = Perception(without(passing.clip, "labels")).mask(3), passing.moving(3)
     assert mask.dtype == np.bool_ and moving.mean() > 0.05
@@ -278,8 +278,8 @@ def test_seconds_are_exclusive(monkeypatch: pytest.MonkeyPatch) -> None:
 
     clip = drive(4).clip
     samples = (replace(s, image=slow(s, "image", 1), depth=slow(s, "depth", 10)) for s in clip)
-    told = SimpleNamespace(perf_counter=lambda: clock[0], perf_counter_ns=lambda: 0, process_time=lambda: 0.0)
-    monkeypatch.setattr("vestcl.clock.time", told)
+    fake_time = SimpleNamespace(perf_counter=lambda: clock[0], perf_counter_ns=lambda: 0, process_time=lambda: 0.0)
+    monkeypatch.setattr("vestcl.clock.time", fake_time)
     perception = Perception(replace(clip, samples=tuple(samples)))
     perception.seen(FRAME)
     taken = {stage: seconds for stage, seconds in perception.seconds.items() if seconds}
@@ -301,7 +301,7 @@ def test_seconds_add_up_to_what_it_took() -> None:
 def test_no_depth_and_no_second_camera_takes_motion() -> None:
     clip = without(drive(4).clip, "depth", "right")
     depth, truth = Perception(clip).raw_depth(FRAME), drive(4).clip[FRAME].read_depth()
-    near = truth < 40  # its shape; test_scene_motion_depth.py holds the metres, on larger pictures
+    near = truth < 40  # its shape; test_scene_motion_depth.py holds the metres, on larger images
     assert (depth > 0).all() and np.corrcoef(np.log(depth[near]), np.log(truth[near]))[0, 1] > 0.6
     assert Perception(clip).prev_from_cur(FRAME)[2, 3] > 0.3  # the frame before was behind
     assert Perception(clip).raw_depth(0).shape == depth.shape
@@ -346,7 +346,7 @@ def test_a_right_camera_with_other_intrinsics() -> None:
     assert np.median(np.abs(found[both] / expected[both] - 1)) < 0.02
 
 
-def test_one_frame_alone_has_no_depth() -> None:
+def test_a_single_frame_has_no_depth() -> None:
     clip = without(drive(4).clip, "depth", "right")[:1]
     with pytest.raises(ValueError, match="needs two frames, a right camera or depth, got one frame alone"):
         Perception(clip).raw_depth(0)

@@ -1,4 +1,4 @@
-"""vestcl.scene.motion.photometric: velocities that the pictures confirm."""
+"""vestcl.scene.motion.photometric: velocities that the images confirm."""
 
 import numpy as np
 import pytest
@@ -9,24 +9,24 @@ from vestcl.scene.motion.photometric import Pair, confirmed, search
 
 PREV_FROM_CUR = turned(0.01, -0.004, 0.002, (0.03, -0.01, 0.9))
 
-#: Where the thing is, and how far, metres.
+#: Where the object is, and how far, metres.
 BOX, BOX_DEPTH = np.s_[35:65, 100:150], 10.0
 
 STILL = np.zeros((2, 3))
 
 
 def scene() -> tuple[np.ndarray, Floats]:
-    """A box before a wall, as things and as depth."""
-    things, depth = np.zeros((HEIGHT, WIDTH), np.int32), flat(40)
-    things[BOX], depth[0][BOX] = 1, BOX_DEPTH
-    return things, depth
+    """A box before a wall, as objects and as depth."""
+    instances, depth = np.zeros((HEIGHT, WIDTH), np.int32), flat(40)
+    instances[BOX], depth[0][BOX] = 1, BOX_DEPTH
+    return instances, depth
 
 
 def seen_moving(v: tuple[float, float, float], grain: float = 0.0) -> Pair:
-    """Both pictures of a box that moves by v, with so much noise in them."""
-    things, depth = scene()
+    """Both images of a box that moves by v, with so much noise in them."""
+    instances, depth = scene()
     before = noise(seed=5, blur=2.0)
-    x, y, z = move(PREV_FROM_CUR, points(depth) - (things > 0) * np.array(v)[:, None, None])
+    x, y, z = move(PREV_FROM_CUR, points(depth) - (instances > 0) * np.array(v)[:, None, None])
     now = sample(before, K[0, 0] * x / z + K[0, 2] - 0.5, K[1, 1] * y / z + K[1, 2] - 0.5, outside=0.5)
     rng = np.random.default_rng(1)
     grainy = [np.float32(image + rng.normal(0, grain, image.shape)).clip(0, 1) for image in (now, before)]
@@ -70,7 +70,7 @@ def test_what_flow_says_is_tried_too() -> None:
 
 
 @pytest.mark.parametrize("grain", [0.0, 0.02])
-def test_a_parked_car_stands_whatever_flow_says(grain: float) -> None:
+def test_a_parked_car_is_static_whatever_flow_says(grain: float) -> None:
     assert not found((0.0, 0.0, 0.0), np.array([[0.0, 0, 0], [2.4, 0.0, -2.1]]), grain).any()
 
 
@@ -81,21 +81,21 @@ def test_impossible_speeds_are_not_believed(v: tuple[float, float, float]) -> No
     assert np.linalg.norm(velocity[1]) < 4.5 and velocity[1, 2] > -0.5 * BOX_DEPTH
 
 
-def test_what_creeps_stands() -> None:
+def test_what_creeps_is_static() -> None:
     assert not found((0.0, 0.0, 0.03)).any()
 
 
 @pytest.mark.parametrize("why", ["no depth", "too small", "no colour"])
-def test_of_what_can_not_be_told_nothing_is_said(why: str) -> None:
-    (things, depth), pair = scene(), seen_moving((0.0, 0.0, 0.9))
+def test_of_what_can_not_be_measured_nothing_is_said(why: str) -> None:
+    (instances, depth), pair = scene(), seen_moving((0.0, 0.0, 0.9))
     if why == "no depth":
         depth[0][BOX] = 0
     if why == "too small":
-        things[:] = 0
-        things[40:45, 110:115] = 1
+        instances[:] = 0
+        instances[40:45, 110:115] = 1
     if why == "no colour":
         pair = pair._replace(image=np.full_like(pair.image, 0.5), image_prev=np.full_like(pair.image, 0.5))
-    assert not search(things, np.array([[0.0, 0, 0], [0.3, 0.0, 0.9]]), depth, pair).any()
+    assert not search(instances, np.array([[0.0, 0, 0], [0.3, 0.0, 0.9]]), depth, pair).any()
 
 
 def test_nothing_outside_the_frame_before_counts() -> None:

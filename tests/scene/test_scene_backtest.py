@@ -73,7 +73,7 @@ def test_residual_flow_is_per_interval() -> None:
 
 
 def test_candidates_by_hand() -> None:
-    """Flow of 2 px an interval to the right, an object of 0.5 m an interval, the camera 1 m ahead: 10 m become 8."""
+    """Flow of 2 px per interval to the right, an object of 0.5 m per interval, the camera 1 m ahead: 10 m become 8."""
     frame = frames(2.0, 2.0)[1]
     frame = frame._replace(velocity=np.full_like(frame.velocity, 0) + np.float32([0.5, 0, 0])[:, None, None])
     ahead = np.eye(4)
@@ -98,7 +98,7 @@ def test_flow_itself_is_a_candidate_where_depth_is_from_motion() -> None:
 
 @pytest.mark.parametrize("ahead", [1.0, 2.0, 2.5])
 def test_at_a_place_motion_ends_where_the_flow_does(ahead: float) -> None:
-    """The left half moves by 8 px an interval, and what crosses to the right half stops there."""
+    """The left half moves by 8 px per interval, and what crosses to the right half stops there."""
     positions, _ = candidates(frame := frames(8.0, 0.0)[1], residual_flow(frame), STILL, ahead)
     far = positions[PLACE][0, :, :40]
     np.testing.assert_allclose(far, CENTRES[0, :, :40] + 8 * ahead, atol=1e-3)
@@ -134,7 +134,7 @@ def test_errors_of_two_frames_are_brought_along_both_flows() -> None:
     assert centre[1] - centre[0] == pytest.approx(3.0, abs=0.4)
 
 
-def test_candidates_that_err_alike_are_averaged() -> None:
+def test_candidates_with_equal_errors_are_averaged() -> None:
     positions = np.stack([np.full((2, 4, 4), value, np.float32) for value in (1.0, 3.0)])
     np.testing.assert_allclose(mixed(positions, np.ones((2, 4, 4), np.float32)), 2.0, atol=1e-6)
 
@@ -177,7 +177,7 @@ def test_what_no_candidate_explains_follows_its_surroundings() -> None:
     assert np.abs(found[0, 4:9] - 0).max() < 0.1 and np.abs(found[0, 22:28, 24:46] - 5).max() < 0.1
     assert np.abs(found[1]).max() < 1e-3
     kept = coherent(np.asarray(centres + way, np.float32), errors, image, np.zeros_like(moving)) - centres
-    assert np.array_equal(kept, way), "static pixels keep their own motion"
+    assert np.array_equal(kept, way), "static pixels keep their motion"
 
 
 def test_an_object_is_held_together() -> None:

@@ -75,7 +75,7 @@ def test_uneven_intervals_of_a_steady_drive_change_nothing() -> None:
     assert future[1][2, 3] == pytest.approx(-7.0, abs=0.1)
 
 
-def test_a_camera_that_looks_aside_and_sits_ahead_is_learnt() -> None:
+def test_a_camera_that_looks_aside_and_sits_ahead_is_learned() -> None:
     turn = np.radians(2.0)  # it looks 2 degrees to the right, 1.5 m ahead of the centre of rotation
     rates = 0.3 * np.sin(0.5 * np.arange(60))
     motions = drive(rates, np.full(60, 10.0), 0.1)

@@ -1,4 +1,4 @@
-"""vestcl.scene.depth.completion: known depth is kept, and goes up to the edges of the picture."""
+"""vestcl.scene.depth.completion: known depth is kept, and goes up to the edges of the image."""
 
 from typing import Any
 
@@ -10,13 +10,13 @@ from vestcl.scene.depth.completion import complete_depth
 
 
 def scattered(depth: Floats, share: float = 0.05) -> Floats:
-    """Only so many pixels are known."""
+    """Only this many pixels are known."""
     keep = np.random.default_rng(0).random(depth.shape) < share
     return np.where(keep, depth, np.float32(0))
 
 
 def halves() -> tuple[Floats, Floats]:
-    """Dark at 5 m to the left of column 160, bright at 50 m to its right: the picture and its depth."""
+    """Dark at 5 m to the left of column 160, bright at 50 m to its right: the image and its depth."""
     left = np.arange(WIDTH) < WIDTH // 2
     image = np.broadcast_to(np.where(left, 0.2, 0.8), (3, HEIGHT, WIDTH)).astype(np.float32)
     return image, np.broadcast_to(np.where(left, 5, 50), (1, HEIGHT, WIDTH)).astype(np.float32)
@@ -34,13 +34,13 @@ def test_nothing_to_do() -> None:
     assert np.array_equal(complete_depth(room(), noise()), room())
 
 
-def test_crisp_at_an_edge_of_the_picture() -> None:
+def test_crisp_at_an_edge_of_the_image() -> None:
     image, truth = halves()
     np.testing.assert_allclose(complete_depth(scattered(truth), image), truth, rtol=0.02)
 
 
 def test_without_an_edge_depth_blends() -> None:
-    """The same depths in a picture that shows no edge."""
+    """The same depths in an image that shows no edge."""
     _, truth = halves()
     blended = complete_depth(scattered(truth), np.full((3, HEIGHT, WIDTH), 0.5, np.float32))
     across = blended[0, :, 150:170]

@@ -1,4 +1,4 @@
-"""vestcl.scene.flow.correspondence: shifts that are known, and what leaves the picture."""
+"""vestcl.scene.flow.correspondence: shifts that are known, and what leaves the image."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ SUBPIXEL = 0.1
 
 
 def shifted(right: int, down: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Two windows of one picture: src(p) = dst(p + (right, down))."""
+    """Two windows of one image: src(p) = dst(p + (right, down))."""
     canvas = noise(HEIGHT + 40, WIDTH + 40, seed, blur=2.0)
     src = canvas[:, 20 : 20 + HEIGHT, 20 : 20 + WIDTH]
     return src, canvas[:, 20 - down : 20 - down + HEIGHT, 20 - right : 20 - right + WIDTH]
@@ -31,13 +31,13 @@ def test_a_shift_is_found(shift: tuple[int, int]) -> None:
 
 
 def test_half_a_pixel() -> None:
-    """Five pixels of pictures of twice the size."""
+    """Five pixels of images of twice the size."""
     src, dst = (picture.reshape(3, HEIGHT // 2, 2, WIDTH // 2, 2).mean((2, 4)) for picture in shifted(5, 0))
     flow_uv = correspond(src, dst).flow_uv[:, 8:-8, 8:-8]
     np.testing.assert_allclose(np.median(flow_uv, axis=(1, 2)), [2.5, 0], atol=SUBPIXEL)
 
 
-def test_the_error_is_infinite_exactly_where_flow_leaves_the_picture() -> None:
+def test_the_error_is_infinite_exactly_where_flow_leaves_the_image() -> None:
     found = correspond(*shifted(9, 0))
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     column, row = x + found.flow_uv[0], y + found.flow_uv[1]
@@ -56,12 +56,12 @@ def test_what_dst_hides_does_not_return() -> None:
     assert np.median(error[36:64, 162:170]) > 2 > 0.2 > np.median(error[36:64, 110:150])
 
 
-def test_still_pictures() -> None:
+def test_still_images() -> None:
     found = correspond(noise(), noise())
     assert np.abs(found.flow_uv).max() < SUBPIXEL and np.median(found.error) < SUBPIXEL
 
 
-def test_flow_is_doubted_where_the_picture_has_no_texture_or_only_a_line() -> None:
+def test_flow_is_doubted_where_the_image_has_no_texture_or_only_a_line() -> None:
     """Blank, a vertical edge and noise, side by side: only the last one holds flow in both directions."""
     image = np.full((3, HEIGHT, WIDTH), 0.5, np.float32)
     image[:, :, 150:] = 0.8  # an edge along the columns

@@ -1,4 +1,4 @@
-"""What networks see of a picture: as transformers' own processors prepare it, and sizes computed by hand."""
+"""What networks see of an image: as transformers' own processors prepare it, and sizes computed by hand."""
 
 import json
 from pathlib import Path
@@ -24,7 +24,7 @@ PREPARED: dict[str, tuple[dict[str, Any], float]] = {
 
 @pytest.mark.parametrize("name", PREPARED)
 @pytest.mark.parametrize("size", [(48, 120), (75, 40), (100, 260)])
-def test_pictures_are_prepared_as_transformers_does(tmp_path: Path, name: str, size: tuple[int, int]) -> None:
+def test_images_are_prepared_as_transformers_does(tmp_path: Path, name: str, size: tuple[int, int]) -> None:
     """Up to Pillow's rounding to whole steps of 1/255, some 0.02 after the division by the deviation."""
     settings, tolerance = PREPARED[name]
     theirs = processor(name)(**settings)

@@ -62,7 +62,7 @@ def test_what_is_not_estimated_stays_the_clips_own() -> None:
     assert [sample.name for sample in depth_only] == ["0", "1"] and depth_only[1].K is own[1].K
 
 
-def test_a_resized_sample_estimates_the_whole_picture() -> None:
+def test_a_resized_sample_estimates_the_whole_image() -> None:
     shapes = []
 
     def depth(image: Image) -> Image:

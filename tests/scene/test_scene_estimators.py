@@ -50,7 +50,7 @@ CLASS = ("segformer", "mask2former")
 
 @pytest.mark.parametrize("name", DEPTH)
 @pytest.mark.parametrize("size", [(48, 120), (37, 41), (5, 90)])
-def test_depth_is_metres_at_the_pictures_size(checkpoints: Path, name: str, size: tuple[int, int]) -> None:
+def test_depth_is_metres_at_the_images_size(checkpoints: Path, name: str, size: tuple[int, int]) -> None:
     estimator = DepthEstimator.load(checkpoints / name)
     depth = estimator(picture(*size))
     assert depth.shape == (1, *size) and depth.dtype == np.float32
@@ -60,11 +60,11 @@ def test_depth_is_metres_at_the_pictures_size(checkpoints: Path, name: str, size
 
 
 @pytest.mark.parametrize("name", DEPTH)
-def test_a_batch_gives_what_each_picture_gives_alone(checkpoints: Path, name: str) -> None:
+def test_a_batch_gives_what_each_image_gives(checkpoints: Path, name: str) -> None:
     estimator = DepthEstimator.load(checkpoints / name)
     images = np.stack([picture(seed=seed) for seed in range(3)])
-    alone = np.stack([estimator(image) for image in images])
-    np.testing.assert_allclose(estimator.batch(images), alone, rtol=1e-4)
+    single = np.stack([estimator(image) for image in images])
+    np.testing.assert_allclose(estimator.batch(images), single, rtol=1e-4)
 
 
 def test_zoedepth_measures_streets_whatever_its_classifier_votes(checkpoints: Path) -> None:
@@ -80,7 +80,7 @@ def test_zoedepth_measures_streets_whatever_its_classifier_votes(checkpoints: Pa
         room(picture())
 
 
-def test_zoedepth_averages_with_the_mirrored_picture(checkpoints: Path) -> None:
+def test_zoedepth_averages_with_the_mirrored_image(checkpoints: Path) -> None:
     image = picture()
     both = DepthEstimator.load(checkpoints / "one-head")
     np.testing.assert_allclose(both(image[..., ::-1]), both(image)[..., ::-1], rtol=1e-4)
@@ -89,7 +89,7 @@ def test_zoedepth_averages_with_the_mirrored_picture(checkpoints: Path) -> None:
 
 
 @pytest.mark.parametrize("zoe", [True, False])
-def test_depth_lies_where_the_picture_has_it(zoe: bool) -> None:
+def test_depth_lies_where_the_image_has_it(zoe: bool) -> None:
     """A network that answers with what it sees: padding, resize, mirroring and their undoing move nothing."""
     settings = {"size": {"height": 64, "width": 64}, "keep_aspect_ratio": True, "resample": 2, **HALVES}
     preparation = Preparation.read("", {**settings, "ensure_multiple_of": 32}, zoe=zoe, size=None)
@@ -128,7 +128,7 @@ def test_classes_agree_with_transformers(checkpoints: Path, name: str, kind: str
 
 
 @pytest.mark.parametrize("name", CLASS)
-def test_classes_are_train_ids_at_the_pictures_size(checkpoints: Path, name: str) -> None:
+def test_classes_are_train_ids_at_the_images_size(checkpoints: Path, name: str) -> None:
     estimator = SegmentationEstimator.load(checkpoints / name)
     images = np.stack([picture(37, 41, seed) for seed in range(2)])
     ids = estimator.batch(images)
@@ -137,7 +137,7 @@ def test_classes_are_train_ids_at_the_pictures_size(checkpoints: Path, name: str
     assert background(ids).shape == ids.shape
 
 
-def test_a_size_of_ones_own(checkpoints: Path) -> None:
+def test_a_size_from_the_user(checkpoints: Path) -> None:
     assert DepthEstimator.load(checkpoints / "one-head", size=(100, 300)).preparation.network_size(375, 1242) == (
         96,
         288,
@@ -263,7 +263,7 @@ def test_damaged_weights_do_not_pass_as_an_answer(checkpoints: Path, weights: st
         (np.full((3, 48, 120), np.nan, np.float32), r"must be in \[0, 1\], got nan"),
     ],
 )
-def test_what_is_no_picture(image: NDArray[np.generic], message: str) -> None:
+def test_what_is_not_an_image(image: NDArray[np.generic], message: str) -> None:
     preparation = Preparation.read("", {"size": 32, "resample": 2, **HALVES}, zoe=False, size=None)
     for estimator in (
         DepthEstimator(None, preparation, None, False, "cpu"),

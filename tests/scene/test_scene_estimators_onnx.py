@@ -220,7 +220,7 @@ def test_descriptions_are_read_strictly(file: Path, description: dict[str, Any],
         ({"movable": [-1]}, "movable must be a list of class indices from 0"),
         ({"movable": [3]}, "has 3 classes, and its JSON lists class 3"),
         ({"classes": "ade20k"}, r"must give scores of 150 classes, .* got result \[1, 3, 4, 6\]"),
-        ({"meaning": "classes"}, r"must be one value a pixel, \[1, 1, H, W\], got result \[1, 3, 4, 6\]"),
+        ({"meaning": "classes"}, r"must be one value per pixel, \[1, 1, H, W\], got result \[1, 3, 4, 6\]"),
     ],
 )
 def test_descriptions_of_classes_are_read_strictly(file: Path, description: dict[str, Any], message: str) -> None:
@@ -299,14 +299,14 @@ def test_several_outputs_need_a_name(file: Path, image: np.ndarray) -> None:
 def test_truncated_files(file: Path, keep: int) -> None:
     content = write_mix(file, [RED]).read_bytes()
     file.write_bytes(content[:keep])
-    with pytest.raises(ValueError, match=r"network.onnx: is no ONNX file, or a truncated one"):
+    with pytest.raises(ValueError, match=r"network.onnx: is not an ONNX file, or a truncated one"):
         OnnxDepth.load(file)
 
 
 @pytest.mark.parametrize("content", [b"<html>no</html>", b"version https://git-lfs.github.com/spec/v1\n", b"\xff" * 99])
 def test_files_of_another_kind(file: Path, content: bytes) -> None:
     file.write_bytes(content)
-    with pytest.raises(ValueError, match="is no ONNX file"):
+    with pytest.raises(ValueError, match="is not an ONNX file"):
         OnnxDepth.load(file)
 
 
@@ -352,7 +352,7 @@ def test_a_description_may_name_its_network(tmp_path: Path, image: np.ndarray) -
         OnnxDepth.load(described)
 
 
-def test_files_folders_and_names_are_told_apart_by_what_exists(tmp_path: Path) -> None:
+def test_files_folders_and_names_are_distinguished_by_what_exists(tmp_path: Path) -> None:
     def is_file(path: Path | str) -> bool:
         return forecast_checks.is_network_file("depth_model", str(path))
 

@@ -11,7 +11,7 @@ from vestcl.scene.motion.backtest import BacktestFrame, backtest
 
 STILL = np.zeros((2, HEIGHT, WIDTH), np.float32)
 
-#: Levels of half a picture's range: 1.2 times that clips nothing.
+#: Levels of half an image's range: 1.2 times that clips nothing.
 GREY = 0.1 + 0.6 * noise(seed=3, blur=2.0)
 
 
@@ -79,7 +79,7 @@ def test_values_at_the_nearest_pixels() -> None:
 
 @pytest.mark.parametrize("gain", [1.2, 1 / 1.2, 1.5])
 def test_flow_between_different_exposures(gain: float) -> None:
-    """Half a picture moves by 3 px, half does not."""
+    """Half an image moves by 3 px, half does not."""
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     flow_uv = np.stack([np.where(x < WIDTH / 2, 3, 0), np.zeros_like(x)]).astype(np.float32)
     now = sample(GREY, x + flow_uv[0], y, outside=0.4)

@@ -43,7 +43,7 @@ def test_what_is_in_the_hole_does_not_matter() -> None:
     assert np.array_equal(fill_holes(image, inverse, hole), fill_holes(other, elsewhere, hole))
 
 
-def test_a_slope_goes_on_through_the_hole() -> None:
+def test_a_slope_continues_through_the_hole() -> None:
     slope = np.broadcast_to(np.linspace(0, 1, WIDTH, dtype=np.float32), (1, HEIGHT, WIDTH))
     _, inverse, hole = scene()
     filled = fill_holes(slope, np.full_like(inverse, 0.1), hole)
@@ -93,8 +93,8 @@ def test_deep_holes_are_wide_and_inside() -> None:
     assert deep[0, 45:55, 105:125].all() and not deep[0, :, 150:].any() and not (deep & ~hole).any()
 
 
-def test_a_hole_at_the_border_is_filled_from_all_sides_alike() -> None:
-    """Near below and far above, as in the tests above, but the hole reaches the picture's edge."""
+def test_a_hole_at_the_border_is_filled_from_all_sides() -> None:
+    """Near below and far above, as in the tests above, but the hole reaches the image's edge."""
     image = np.zeros((1, 64, 64), np.float32)
     image[:, 32:] = 1
     inverse = np.where(image > 0, np.float32(0.5), np.float32(0.01))
@@ -102,8 +102,8 @@ def test_a_hole_at_the_border_is_filled_from_all_sides_alike() -> None:
     inside[0, 24:40, 20:40], border[0, 24:40, :20] = True, True
     at = np.s_[0, 28:36]
     far = float((fill_holes(image, inverse, inside)[at][:, 20:40] < 0.5).mean())
-    alike = float((fill_holes(image, inverse, border)[at][:, :20] < 0.5).mean())
-    assert far > 0.9 and 0.3 < alike < 0.7
+    equal = float((fill_holes(image, inverse, border)[at][:, :20] < 0.5).mean())
+    assert far > 0.9 and 0.3 < equal < 0.7
 
 
 def test_same_bits_twice() -> None:

@@ -171,11 +171,11 @@ def test_lama_from_a_file(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 def test_a_file_that_is_no_lama(tmp_path: Path) -> None:
     (tmp_path / "big-lama.pt").write_bytes(b"no weights")
-    with pytest.raises(ValueError, match="is no TorchScript module"):
+    with pytest.raises(ValueError, match="is not a TorchScript module"):
         Lama(tmp_path / "big-lama.pt")
 
 
-def test_an_inpainter_of_ones_own() -> None:
+def test_an_inpainter_from_the_user() -> None:
     image, depth, mask, *_ = room()
     filled, _ = inpaint_background(image, depth, mask, method=lambda colour, hole, road: np.zeros_like(colour))
     assert (filled[:, ~mask[0]] == 0).all()

@@ -102,7 +102,7 @@ def test_arguments(name: str, value: NDArray[Any], message: str) -> None:
         build_layers(**frame() | {name: value})
 
 
-def test_depth_in_the_sky_alone_is_none() -> None:
+def test_depth_only_in_the_sky_is_none() -> None:
     given = frame()
     given["depth"] = np.where(given["sky"], np.float32(50), np.float32(0))
     with pytest.raises(ValueError, match="`depth` must have a valid pixel outside the sky"):

@@ -32,7 +32,7 @@ def scanned(depth: Floats, rows: int = 4, columns: int = 2) -> Floats:
 
 
 def board() -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """A bright board at 8 m before a dark wall at 30 m: picture, depth, and where the board is."""
+    """A bright board at 8 m before a dark wall at 30 m: image, depth, and where the board is."""
     on_board = np.zeros((1, HEIGHT, WIDTH), bool)
     on_board[:, 30:70, 90:150] = True
     image = np.repeat(np.where(on_board, np.float32(0.8), np.float32(0.2)), 3, axis=0)
@@ -41,7 +41,7 @@ def board() -> tuple[Floats, Floats, NDArray[np.bool_]]:
 
 
 def test_a_plane_is_exact() -> None:
-    """The inverse depth of a plane is affine in (u, v); a picture without edges lets every fit see its surroundings."""
+    """The inverse depth of a plane is affine in (u, v); an image without edges lets every fit see its surroundings."""
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     truth = (1 / (0.02 + 0.001 * v + 0.0001 * u))[None]
     dense = densify(scanned(truth), np.full((3, HEIGHT, WIDTH), 0.5, np.float32))
@@ -49,7 +49,7 @@ def test_a_plane_is_exact() -> None:
     np.testing.assert_allclose(dense[inner], truth[inner], rtol=0.02)
 
 
-def test_edges_follow_the_picture() -> None:
+def test_edges_follow_the_image() -> None:
     image, truth, _ = board()
     dense = densify(scanned(truth, rows=6, columns=3), image)
     assert dense.shape == truth.shape and dense.dtype == np.float32
@@ -68,7 +68,7 @@ def test_what_shines_through_is_dropped() -> None:
 
 
 def test_never_beyond_the_returns_by_much() -> None:
-    """Above all returns the depth goes on, within a factor of the nearest return's."""
+    """Above all returns the depth continues, within a factor of the nearest return's."""
     image, truth, _ = board()
     scan = scanned(truth)
     scan[:, :50] = 0
@@ -113,7 +113,7 @@ def test_arguments() -> None:
 
 @pytest.mark.parametrize("index", [8, 40])
 def test_kitti_beats_the_nearest_return(index: int) -> None:
-    """A fifth of the returns is hidden; both are held against it in inverse depth, where what is near counts most."""
+    """A fifth of the returns is hidden; both are compared with it in inverse depth, where what is near counts most."""
     folder = real("kitti_clip")
     image = read_image(folder / "image" / f"{index:06d}.jpg")
     scan = read_depth(folder / "depth" / f"{index:06d}.png", UNITS_PER_METRE)[None]

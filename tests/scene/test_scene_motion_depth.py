@@ -141,9 +141,9 @@ def test_a_cars_depth_ends_with_it() -> None:
         image[:] = 0.5 + 0.1 * (image - 0.5)  # few edges that depth would end at
         image[:, rows, 40 + 5 * i : 160 + 5 * i] = noise
     left, right = 40 + 5 * (len(images) - 1), 160 + 5 * (len(images) - 1)
-    found, beside = motion_depth(images, K), np.r_[left - 30 : left - 8, right + 8 : right + 30]
+    found, around = motion_depth(images, K), np.r_[left - 30 : left - 8, right + 8 : right + 30]
     road = np.s_[0, HEIGHT // 2 + 20 : HEIGHT // 2 + 36, WIDTH // 2]
-    level = found.depth[0, HEIGHT // 2 + 20 : HEIGHT // 2 + 36][:, beside]
+    level = found.depth[0, HEIGHT // 2 + 20 : HEIGHT // 2 + 36][:, around]
     assert np.median(np.abs(level / depth[road][:, None] - 1)) < 0.05
 
 
@@ -176,8 +176,8 @@ def test_stop_after_a_drive_keeps_the_depth() -> None:
     assert np.median(off(found.depth, depth)) < 0.1
 
 
-def test_car_that_keeps_its_distance_stands_on_the_road() -> None:
-    """It does not move in the picture, as if it were infinitely far away."""
+def test_car_that_keeps_its_distance_is_on_the_road() -> None:
+    """It does not move in the image, as if it were infinitely far away."""
     poses = ahead()
     images, depth = drive(poses, [at[2, 3] + 10.0 for at in poses])
     found = motion_depth(images, K)
@@ -192,7 +192,7 @@ def test_nothing_to_see() -> None:
     assert np.array_equal(found.prev_from_cur, np.eye(4)) and not found.confidence.any()
 
 
-def test_pictures_without_common_content() -> None:
+def test_images_without_common_content() -> None:
     rng = np.random.default_rng(0)
     found = motion_depth([rng.random((3, HEIGHT, WIDTH), np.float32) for _ in range(3)], K)
     check_complete(found)
@@ -250,7 +250,7 @@ def test_motorway_forecast_beats_repeating() -> None:
     clip = open_video(real("highway.mp4"))
     images = [clip[i].read_image() for i in range(27, 32)]
     found = motion_depth(images[:-1], clip[0].K)
-    assert 0.5 < found.prev_from_cur[2, 3] < 1.5, "a motorway's speed at 25 frames a second"
+    assert 0.5 < found.prev_from_cur[2, 3] < 1.5, "a motorway's speed at 25 frames per second"
     motion = constant_velocity([np.asarray(np.linalg.inv(found.prev_from_cur), np.float64)])
     shape = np.zeros((2, *found.depth.shape[1:]), np.float32)
     flow = torch.from_numpy((rigid_pixels(found.depth, clip[0].K, motion) - moved_pixels(shape)).astype(np.float32))[

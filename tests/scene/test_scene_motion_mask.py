@@ -1,4 +1,4 @@
-"""vestcl.scene.motion.mask: a box that moves by itself, and all that must not look like one."""
+"""vestcl.scene.motion.mask: a box that moves, and all that must not look like one."""
 
 from typing import Any
 
@@ -78,7 +78,7 @@ def test_empty_streets_as_they_are_seen() -> None:
     assert np.mean(shares) < 0.03
 
 
-def test_what_seems_to_move_on_the_road_is_no_thing() -> None:
+def test_what_seems_to_move_on_the_road_is_not_an_object() -> None:
     """The same wrong flow, on a road and on a wall that stands on it."""
     focal, down = K[1, 1], np.arange(HEIGHT)[:, None] + 0.5 - K[1, 2]
     road = np.minimum(focal * 1.5 / np.maximum(down, 1), 40).astype(np.float32)

@@ -37,7 +37,7 @@ def test_of_texture_all_and_of_asphalt_nothing() -> None:
 
 
 def test_asphalt_stays_part_of_the_road() -> None:
-    """A level road 1.5 m below, 2 m an interval, whose flow was not found: 0. A wall and an object keep their flow."""
+    """A level road 1.5 m below, 2 m per interval, whose flow was not found: 0. A wall and an object keep their flow."""
     y = np.arange(HEIGHT)[:, None] + 0.5 - K[1, 2]
     depth = np.broadcast_to(np.where(y > 4, 1.5 * K[1, 1] / np.maximum(y, 1), 30.0), (1, HEIGHT, WIDTH))
     depth, mask = depth.astype(np.float32), np.ones((1, HEIGHT, WIDTH), bool)

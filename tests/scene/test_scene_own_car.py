@@ -20,7 +20,7 @@ def road(seed: int = 0) -> np.ndarray:
 
 
 def frames(count: int, shift: int, rim: int | None) -> list[np.ndarray]:
-    """[3, H, W], the newest first: a texture that moves down by ``shift`` px a frame, below ``rim`` a bonnet."""
+    """[3, H, W], the newest first: a texture that moves down by ``shift`` px per frame, below ``rim`` a bonnet."""
     images = []
     for back in range(count):
         start = 200 + shift * back

@@ -17,7 +17,7 @@ FLOW_STD = 0.25
 #: Of the inverse depths here, 1/m.
 INVERSE_STD = 1e-3
 
-#: A step to the side, metres, after which flow tells as much as those depths: f t FLOW_STD^-1 = INVERSE_STD^-1.
+#: A step to the side, metres, after which flow is worth as much as those depths: f t FLOW_STD^-1 = INVERSE_STD^-1.
 SIDE = FLOW_STD / INVERSE_STD / K[0, 0]
 SIDEWAYS = turned(0, 0, 0, (-SIDE, 0.0, 0.0))
 
@@ -103,7 +103,7 @@ def test_flow_that_does_not_return_changes_nothing() -> None:
     np.testing.assert_allclose(refined[BLOCK], depth[BLOCK], rtol=1e-6)
 
 
-def test_what_moves_is_left_alone() -> None:
+def test_what_moves_is_unchanged() -> None:
     depth, static = room(), EVERYWHERE.copy()
     depth[BLOCK] /= 2
     static[BLOCK] = False
@@ -111,7 +111,7 @@ def test_what_moves_is_left_alone() -> None:
     np.testing.assert_allclose(refined[BLOCK], depth[BLOCK], rtol=1e-6)
 
 
-def test_even_a_small_thing_that_moves_is_left_alone() -> None:
+def test_even_a_small_object_that_moves_is_unchanged() -> None:
     """A pedestrian of 8 x 16 pixels at 6 m before a wall at 40 m is no island."""
     depth, static = flat(40), EVERYWHERE.copy()
     small = np.s_[:, 40:56, 150:158]

@@ -1,4 +1,4 @@
-"""vestcl.scene.sky on pictures made for it, on the street, and on real ones."""
+"""vestcl.scene.sky on images made for it, on the street, and on real ones."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ UNITS_PER_METRE = 256
 
 
 def horizon() -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Even light blue above row 25, dark noise below: the picture, and where its sky is."""
+    """Even light blue above row 25, dark noise below: the image, and where its sky is."""
     image = np.random.default_rng(0).random((3, HEIGHT, WIDTH), np.float32) * np.float32(0.3)
     image[:, :25] = np.array([0.6, 0.75, 0.95], np.float32)[:, None, None]
     return image, np.arange(HEIGHT)[None, :, None] < np.full((1, 1, WIDTH), 25)
@@ -44,7 +44,7 @@ def test_what_does_not_reach_the_upper_border_is_none() -> None:
     assert not sky_mask(image).any()
 
 
-def test_a_bright_wall_is_told_by_its_depth() -> None:
+def test_a_bright_wall_is_identified_by_its_depth() -> None:
     image, _ = horizon()
     depth = np.full((1, HEIGHT, WIDTH), 12, np.float32)
     assert not sky_mask(image, depth).any()
@@ -73,7 +73,7 @@ def test_the_sky_of_a_stereo_pair_has_no_surface(left: float, right: float, is_s
 
 
 def test_the_sky_of_a_stereo_pair_is_above_the_road() -> None:
-    """A white wall at the side is none beside the sky, nor without it, however its matched depths vary."""
+    """A white wall at the side is none next to the sky, nor without it, however its matched depths vary."""
     image, truth = horizon()
     wall = np.s_[:, :25, 130:]
     image[wall] = 1.0

@@ -63,7 +63,7 @@ def test_far_is_a_limit() -> None:
 
 
 def test_nothing_to_match() -> None:
-    """A picture against another's noise has no agreement worth the name; nothing breaks, and nothing is negative."""
+    """An image against another's noise has no agreement worth the name; nothing breaks, and nothing is negative."""
     left, right = np.random.default_rng(1).random((2, 3, HEIGHT, WIDTH), np.float32)
     depth = stereo_depth(left, right, K, rig(), fill=False)
     assert np.isfinite(depth).all() and (depth >= 0).all() and (depth == 0).mean() > 0.5
@@ -75,7 +75,7 @@ def test_same_bits_twice() -> None:
 
 
 def test_real_pair_warps_onto_the_left() -> None:
-    """KITTI odometry at full size: the right picture warped by the depth is the left one, to 22 dB."""
+    """KITTI odometry at full size: the right image warped by the depth is the left one, to 22 dB."""
     sample = open_sequence(real("kitti_odometry") / "sequences" / "06")[16]
     assert sample.right is not None
     left, right = sample.read_image(), sample.right.read_image()

@@ -37,7 +37,7 @@ def street() -> Clip:
 
 
 def bare() -> Clip:
-    """Pictures with depth and nothing else: a texture that moves sideways."""
+    """Images with depth and nothing else: a texture that moves sideways."""
     rng = np.random.default_rng(0)
     texture = rng.random((3, HEIGHT, WIDTH + 2 * FRAMES), np.float32)
     K = np.array([[60, 0, WIDTH / 2], [0, 60, HEIGHT / 2], [0, 0, 1.0]])
@@ -320,7 +320,7 @@ def fault_of(folder: Path, clip: Clip, whole: list[Any], content: dict[str, byte
     except ValueError as error:
         text = str(error)
         if "\n" in text or str(folder) not in text or not text.endswith("run `vestcl prepare` again"):
-            return f"its error is no line with file and remedy: {text!r}"
+            return f"its error is not a line with file and remedy: {text!r}"
     except Exception as error:
         return f"reading raised {error!r}"
     try:

@@ -261,15 +261,15 @@ class Cloud:
         slope = 2 * self.o / self.r2
         u, v = (slope * sums[name] for name in "uv")
         radii = slope / self.r * sums["d2"]
-        alone, shrunk = sums["1"], sums["d2"] / self.r2
-        opacities = np.stack([alone[0] - shrunk[0], alone[1] + shrunk[1]])
+        single, shrunk = sums["1"], sums["d2"] / self.r2
+        opacities = np.stack([single[0] - shrunk[0], single[1] + shrunk[1]])
         grads["points_uv"] = Bounded(np.hstack([u[0], v[0]]), np.abs(np.hstack([u[1], v[1]])))
         grads["radii"] = Bounded(radii[0, :, 0], np.abs(radii[1, :, 0]))
         grads["opacities"] = Bounded(opacities[0, :, 0], opacities[1, :, 0])
         return {name: grad if name == "backgrounds" else self._scatter(grad) for name, grad in grads.items()}
 
     def _alpha_gradients(self, background: Array, g: Array, h: Array) -> Bounded:
-        """dL/da_i = T_i (f_i.g - A_(i+1)), walking A_i = a_i (f_i.g) + (1 - a_i) A_(i+1) from the back."""
+        """dL/da_i = T_i (f_i.g - A_(i+1)), traversing A_i = a_i (f_i.g) + (1 - a_i) A_(i+1) from the back."""
         eps, roundings = self.eps, g.shape[1] + 2
         fg, fg_error = self.f @ g.T, roundings * self.eps * (np.abs(self.f) @ np.abs(g).T)
         rest, shown = 1 - self.alpha, self.alpha * fg

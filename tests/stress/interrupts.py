@@ -38,7 +38,7 @@ from vestcl import opencl  # noqa: E402
 INTERRUPTS: Final = 2000
 #: Calls after the interrupts, which are compared with a fresh process.
 CALLS: Final = 100
-#: One in so many interrupts is of another thread than the main one.
+#: One in this many interrupts is of another thread than the main one.
 OTHER_THREAD: Final = 10
 #: Seconds after which a call in another thread waits for a lock that nobody will release.
 PATIENCE: Final = 60.0

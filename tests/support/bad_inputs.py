@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from data_files import write_pictures, write_text
+from data_files import write_images, write_text
 from forecast_clips import write_clip
 
 Rng = np.random.Generator
@@ -253,7 +253,7 @@ def frame_bytes(rng: Rng, clip: Path) -> None:
 
 
 def frame_size(rng: Rng, clip: Path) -> None:
-    write_pictures(clip / "image", ["0005.png"], 7, int(rng.integers(1, 30)))
+    write_images(clip / "image", ["0005.png"], 7, int(rng.integers(1, 30)))
 
 
 def frame_special(rng: Rng, clip: Path) -> None:
@@ -307,7 +307,7 @@ def lone_file(rng: Rng, folder: Path) -> Case:
 def layout(rng: Rng, folder: Path) -> Case:
     """A folder that looks like a data set."""
     clip = folder / "2011_09_26_drive_0001_sync"
-    write_pictures(clip / "image_02" / "data", ["0000000000.png", pick(rng, ("0000000002.png", "x.png"))])
+    write_images(clip / "image_02" / "data", ["0000000000.png", pick(rng, ("0000000002.png", "x.png"))])
     if rng.random() < 0.5:
         for name in ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt"):
             write_text(
@@ -318,10 +318,10 @@ def layout(rng: Rng, folder: Path) -> Case:
         write_text(folder / "o" / "calib.txt", pick(rng, ("", "P0: 1", "P2: " + "0 " * 12)))
         clip = folder / "o"
     elif which == "cityscapes":
-        write_pictures(folder / "c" / "leftImg8bit_sequence" / "val" / "ulm", ["ulm_000000_000000_leftImg8bit.png"])
+        write_images(folder / "c" / "leftImg8bit_sequence" / "val" / "ulm", ["ulm_000000_000000_leftImg8bit.png"])
         clip = folder / "c"
     elif which == "virtual":
-        write_pictures(folder / "v" / "frames" / "rgb" / "Camera_0", ["rgb_00000.jpg"])
+        write_images(folder / "v" / "frames" / "rgb" / "Camera_0", ["rgb_00000.jpg"])
         clip = folder / "v"
     return Case(f"layout: {which}", ["forecast", str(clip), "--out", str(folder / "out")])
 

@@ -1,4 +1,4 @@
-"""A corridor of known depth that a camera drives down, with a car in front of it if wanted."""
+"""A corridor of known depth that a camera drives down, with a car in front of it if asked for."""
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ ASIDE, END = 5.0, 45.0
 
 
 def corridor(world_from_cam: np.ndarray, car_z: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Picture [3, H, W] and depth [1, H, W] from a camera: the road is at y = CAMERA_HEIGHT; a car is 2 m wide."""
+    """Image [3, H, W] and depth [1, H, W] from a camera: the road is at y = CAMERA_HEIGHT; a car is 2 m wide."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(K).T @ world_from_cam[:3, :3].T
     eye = world_from_cam[:3, 3]
@@ -47,7 +47,7 @@ def paint(uv: np.ndarray) -> np.ndarray:
 
 
 def drive(poses: list[np.ndarray], cars: list[float] | None = None) -> tuple[list[np.ndarray], np.ndarray]:
-    """The pictures of a drive down the corridor, and the last one's depth."""
+    """The images of a drive down the corridor, and the last one's depth."""
     shots = [corridor(at, None if cars is None else cars[i]) for i, at in enumerate(poses)]
     return [image for image, _ in shots], shots[-1][1]
 

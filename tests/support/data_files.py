@@ -1,4 +1,4 @@
-"""Small pictures and tables in the layouts of data sets, and where real data lies when it is there."""
+"""Small images and tables in the layouts of data sets, and where real data lies when it is there."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 from vestcl.io import write_pixels
 
-#: Real driving data beside the checkout; it is never part of the repository.
+#: Real driving data next to the checkout; it is never part of the repository.
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 
 
@@ -16,7 +16,7 @@ def real(name: str) -> Path:
     """A folder or file of the real data; the test is skipped where it is not there."""
     path = REAL / name
     if not path.exists():
-        pytest.skip(f"real data is not here: ../shared/data/{name} beside the checkout")
+        pytest.skip(f"real data is not here: ../shared/data/{name} next to the checkout")
     return path
 
 
@@ -25,8 +25,8 @@ def picture(height: int = 6, width: int = 8, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), np.uint8)
 
 
-def write_pictures(folder: Path, names: Iterable[str], height: int = 6, width: int = 8) -> None:
-    """Noise, another in every file: the picture of the i-th name has seed i."""
+def write_images(folder: Path, names: Iterable[str], height: int = 6, width: int = 8) -> None:
+    """Noise, another in every file: the image of the i-th name has seed i."""
     for seed, name in enumerate(names):
         write_pixels(folder / name, picture(height, width, seed))
 

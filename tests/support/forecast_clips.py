@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from data_files import write_pictures, write_text
+from data_files import write_images, write_text
 
 from vestcl import opencl
 from vestcl.data.sample import Clip
@@ -49,7 +49,7 @@ class Repeater:
 def write_clip(folder: Path) -> Path:
     """A stereo clip of noise."""
     for side in ("image", "right"):
-        write_pictures(folder / side, [f"{i:04}.png" for i in range(FRAMES)], HEIGHT, WIDTH)
+        write_images(folder / side, [f"{i:04}.png" for i in range(FRAMES)], HEIGHT, WIDTH)
     camera = {"fx": 40, "fy": 40, "cx": 19.5, "cy": 11.5, "fps": 25, "baseline": 0.5}
     write_text(folder / "camera.json", json.dumps(camera))
     return folder

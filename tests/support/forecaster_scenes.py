@@ -47,7 +47,7 @@ SMALL = change(
     refine=dataclasses.replace(TINY.refine, base="filled"),
 )
 
-#: The same, painting anew.
+#: The same, predicting RGB directly.
 PAINTING = dataclasses.replace(SMALL, refine=TINY.refine)
 
 #: Every colour shown by its own pixel alone: at rest nothing blurs.
@@ -85,7 +85,7 @@ def pair_of(batch: int, height: int, width: int, foreground: bool = True) -> tup
 
 
 def wall(height: int, width: int, depth: float) -> LayerBatch:
-    """A random picture on a wall that faces the camera."""
+    """A random image on a wall that faces the camera."""
     image, metres = torch.rand(1, 3, height, width), torch.full((1, 1, height, width), depth)
     return LayerBatch(image, metres, torch.ones_like(metres), image, metres)
 
@@ -98,7 +98,7 @@ def measured(
     cur: tuple[float, ...] = (0, 0, 0),
     velocity: tuple[float, ...] = (0, 0, 0),
 ) -> MotionPrior:
-    """The camera's steady translation and everything's velocity, metres a frame."""
+    """The camera's steady translation and everything's velocity, metres per frame."""
     still = torch.tensor([1.0, 0, 0, 0]).repeat(batch, 1)
     steady = RigidMotion(still, torch.tensor(cur).float().repeat(batch, 1))
     moving = torch.tensor(velocity).float()[:, None, None].repeat(batch, 1, height, width)

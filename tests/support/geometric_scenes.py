@@ -16,13 +16,13 @@ from vestcl.scene.flow.correspondence import Correspondence
 Floats = NDArray[np.float32]
 Matrix = NDArray[np.float64]
 
-#: Small pictures with the proportions of KITTI's.
+#: Small images with the proportions of KITTI's.
 HEIGHT, WIDTH = 96, 320
 
 #: Another focal length each way, and an odd principal point.
 K = np.array([[190.0, 0.0, 157.5], [0.0, 180.0, 45.25], [0.0, 0.0, 1.0]])
 
-#: Camera above the road, and the wall at its end, metres. From a car's 1.65 m neighbouring rows of so small a picture
+#: Camera above the road, and the wall at its end, metres. From a car's 1.65 m neighbouring rows of so small an image
 #: differ by 0.0034 / m on the road, which counts as a jump.
 CAMERA_HEIGHT, WALL = 3.0, 40.0
 

@@ -1,4 +1,4 @@
-"""Prints setup.py's requirements at their lowest versions, one a line: what `make test-lowest` installs.
+"""Prints setup.py's requirements at their lowest versions, one per line: what `make test-lowest` installs.
 
 torch keeps the version of constraints.txt: PyPI has no CPU build of the lowest one. The tools of the extra `dev` are
 current ones: nobody needs them to use vestcl.

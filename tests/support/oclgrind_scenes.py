@@ -124,7 +124,7 @@ def main(arguments: Sequence[str]) -> int:
     for scenes, options in OPTIONS.items():
         command = [oclgrind, *options, sys.executable, __file__, scenes]
         # pyopencl's cache would hand over programs without their source. Reports go to stderr, for a log would be
-        # begun anew by every OpenCL context.
+        # begun again by every OpenCL context.
         environment = os.environ | {"PYOPENCL_NO_CACHE": "1"}
         child = subprocess.run(command, env=environment, stderr=subprocess.PIPE, text=True, check=False)
         found = findings(child.stderr)

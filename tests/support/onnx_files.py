@@ -74,7 +74,7 @@ def write_mix(
         bias: [outputs].
         nhwc: whether the input is [1, H, W, C].
         kind: of the input.
-        pool: the output is the mean over so many pixels a side.
+        pool: the output is the mean over this many pixels per side.
         description: the JSON next to the file, with ``keys``; where both are empty there is none.
         keys: of the JSON.
     """

@@ -19,7 +19,7 @@ from vestcl.io.images import to_pixels, write_pixels
 ROOT = Path(__file__).resolve().parents[2]
 HEIGHT, WIDTH, FRAMES = 48, 160, 4
 
-#: The command in a process of its own.
+#: The command in a separate process.
 COMMAND = (sys.executable, "-c", "import sys; from vestcl.cli.main import main; sys.exit(main())", "prepare")
 SMALL = ("--height", str(HEIGHT), "--width", str(WIDTH), "--frames", str(FRAMES), "--samples", "1")
 
@@ -30,7 +30,7 @@ def options(*inputs: str, **changes: Any) -> cli.Prepare:
 
 
 def write_drive(folder: Path) -> Path:
-    """A street as a folder of files: pictures, depth and labels."""
+    """A street as a folder of files: images, depth and labels."""
     clip = prepare_command.open_input("street:5", options())
     for sample in clip:
         write_pixels(folder / "image" / f"{sample.name}.png", to_pixels(sample.read_image()))
@@ -43,9 +43,9 @@ def write_drive(folder: Path) -> Path:
     return folder
 
 
-def told(folder: Path, **changes: Any) -> cli.Prepare:
-    beside = {"depth": folder / "metres", "depth_scale": 256.0, "labels": folder / "classes"}
-    return options(str(folder), **{**beside, **changes})
+def settings_for(folder: Path, **changes: Any) -> cli.Prepare:
+    extra = {"depth": folder / "metres", "depth_scale": 256.0, "labels": folder / "classes"}
+    return options(str(folder), **{**extra, **changes})
 
 
 def run(settings: cli.Prepare, capsys: pytest.CaptureFixture[str]) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Pictures, and checkpoints as the hub has them: of tiny networks with random weights, which answer in milliseconds."""
+"""Images, and checkpoints as the hub has them: of tiny networks with random weights, which answer in milliseconds."""
 
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,7 @@ def processor(name: str, **settings: Any) -> Any:
 
 
 def save(model: Any, name: str, folder: Path, **settings: Any) -> Path:
-    """With weights of deviation 1 / sqrt(inputs): the answer depends on the picture, but not on its last bits."""
+    """With weights of deviation 1 / sqrt(inputs): the answer depends on the image, but not on its last bits."""
     generator = torch.Generator().manual_seed(0)
     for key, parameter in model.named_parameters():
         if parameter.ndim > 1:

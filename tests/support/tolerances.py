@@ -1,7 +1,7 @@
 """How close is close: one table by dtype, and the comparisons that use it.
 
-Errors are relative, in the Euclidean norm over a whole array. The reference is always the twin in float64, on the
-very numbers that the operator got, so that an error is the operator's own.
+Errors are relative, in the Euclidean norm over a whole array. The reference is always the reference implementation in
+float64, on the very numbers that the operator got, so that an error is the operator's own.
 """
 
 from collections.abc import Callable
@@ -29,10 +29,10 @@ def assert_close(got: torch.Tensor | np.ndarray, wanted: torch.Tensor, what: str
     assert error <= limit, f"{what}: relative error {error:.2e}, allowed {limit:.0e}"
 
 
-def assert_like_twin(operator: Callable[..., Any], twin: Callable[..., Any], **arguments: Any) -> None:
+def assert_like_reference(operator: Callable[..., Any], reference: Callable[..., Any], **arguments: Any) -> None:
     """Compare outputs, and gradients of a random linear loss for every argument that requires grad."""
     exact = {name: _as_double(value) for name, value in arguments.items()}
-    got, wanted = _as_tuple(operator(**arguments)), _as_tuple(twin(**exact))
+    got, wanted = _as_tuple(operator(**arguments)), _as_tuple(reference(**exact))
     weights = [torch.randn_like(output) for output in got]
     for i, (output, truth) in enumerate(zip(got, wanted, strict=True)):
         assert_close(output, truth, f"output {i}")

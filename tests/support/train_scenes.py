@@ -1,4 +1,4 @@
-"""A small street, prepared, and a small network to train on it: here, or in processes that die when they are told to.
+"""A small street, prepared, and a small network to train on it: here, or in processes that die when they are asked to.
 
 As a script it is `train.fit` that knows the small network: ``python tests/support/train_scenes.py run.yaml
 [--resume]``.
@@ -93,11 +93,11 @@ class Processes:
 
     def call(self, function: Callable[..., Any], *arguments: Any, environment: dict[str, str] | None = None) -> int:
         """Its exit status, negative for a signal; what it printed is in ``output``."""
-        told = self._folder / "output.txt"
-        process = self._context.Process(target=_quietly, args=(told, environment or {}, function, arguments))
+        log = self._folder / "output.txt"
+        process = self._context.Process(target=_quietly, args=(log, environment or {}, function, arguments))
         process.start()
         process.join(120)
-        self.output = told.read_text()
+        self.output = log.read_text()
         assert process.exitcode is not None, "it hangs"
         return process.exitcode
 
@@ -114,8 +114,8 @@ def main(arguments: list[str]) -> None:
     sys.exit(fit.main(arguments))
 
 
-def _quietly(told: Path, environment: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    with told.open("w", buffering=1) as file:
+def _quietly(log: Path, environment: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    with log.open("w", buffering=1) as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
         os.environ.update(environment)

@@ -10,7 +10,7 @@ import numpy as np
 #: Ticks per second of presentation times.
 TICKS = 1000
 
-#: Three B frames in a row, and groups of pictures whose first frames refer to the group before.
+#: Three B frames in a row, and groups of images whose first frames refer to the group before.
 REORDERED = {"bf": "3", "x264-params": "open-gop=1:b-pyramid=normal:b-adapt=0:scenecut=0"}
 
 

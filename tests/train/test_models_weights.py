@@ -261,8 +261,8 @@ def test_the_command_line_refuses_in_one_line(tmp_path: Path, capsys: pytest.Cap
     model.save(tmp_path / "m.safetensors")
     asked = ["forecast", "street:", "--out", str(tmp_path / "out"), "--model", str(tmp_path / "m.safetensors")]
     assert cli.main(asked) == 2
-    told = capsys.readouterr()
-    text = " ".join((told.out + told.err).split())
+    reported = capsys.readouterr()
+    text = " ".join((reported.out + reported.err).split())
     assert "must hold finite weights, got NaN in refine.out.weight" in text and "Traceback" not in text
     assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
 

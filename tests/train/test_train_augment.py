@@ -1,4 +1,4 @@
-"""train.data.augment: pictures, cameras and motions change together."""
+"""train.data.augment: images, cameras and motions change together."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,7 +24,7 @@ TGT_FROM_NEXT = turned(0.01, 0.02, -0.01, (-0.54, 0.02, 0.01))
 TARGET_K = np.array([[22.0, 0.3, 5.9], [0, 20.5, 4.4], [0, 0, 1]])
 
 Change = tuple[Callable[[TrainingWindow], TrainingWindow], Callable[[float, float], tuple[float, float]], float]
-"""A change, where it takes a point of the picture, and the sign of x in the changed world."""
+"""A change, where it takes a point of the image, and the sign of x in the changed world."""
 
 CHANGES: dict[str, Change] = {
     "crop": (lambda window: augment.crop(window, 2, 3, 5, 7), lambda u, v: (u - 3, v - 2), 1),
@@ -40,7 +40,7 @@ CHANGES: dict[str, Change] = {
 
 @pytest.fixture
 def window() -> TrainingWindow:
-    """Two random frames, the bonnet in both, and a target from beside."""
+    """Two random frames, the bonnet in both, and a target from the side."""
     target = np.random.default_rng(9).random((3, HEIGHT, WIDTH), np.float32)
     prev, cur = prepared(0, MOTIONS[0], own=True), prepared(1, MOTIONS[1], own=True)
     path = MOTIONS[1], MOTIONS[0] @ MOTIONS[1]
@@ -79,7 +79,7 @@ def test_true_motion_changes_as_the_cameras_do(window: TrainingWindow, name: str
     np.testing.assert_allclose(first, last_motions(changed.cur)[0], rtol=0, atol=1e-12)
 
 
-def test_planes_are_cut_and_mirrored_alike(window: TrainingWindow) -> None:
+def test_planes_are_cut_and_mirrored_equally(window: TrainingWindow) -> None:
     cut, mirrored = augment.crop(window, 2, 3, 5, 7), augment.flip(window)
     for frame in ("prev", "cur"):
         whole, part, other = (getattr(each, frame) for each in (window, cut, mirrored))
@@ -170,7 +170,7 @@ def test_splat_of_the_flipped_window_is_the_flipped_splat(window: TrainingWindow
     torch.testing.assert_close(back, there, rtol=0, atol=1e-9)
 
 
-def test_shrinking_takes_means_of_pictures_and_pixels_of_all_else(window: TrainingWindow) -> None:
+def test_shrinking_takes_means_of_images_and_pixels_of_all_else(window: TrainingWindow) -> None:
     small = augment.resize(window, HEIGHT // 2, WIDTH // 2)
     means = window.target.reshape(3, HEIGHT // 2, 2, WIDTH // 2, 2).mean(axis=(2, 4))
     np.testing.assert_allclose(small.target, means, rtol=0, atol=1e-6)
@@ -180,7 +180,7 @@ def test_shrinking_takes_means_of_pictures_and_pixels_of_all_else(window: Traini
     assert augment.resize(window, HEIGHT, WIDTH) is window
 
 
-def test_all_pictures_are_coloured_alike(window: TrainingWindow) -> None:
+def test_all_images_are_coloured_equally(window: TrainingWindow) -> None:
     change = augment.draw_colour(np.random.default_rng(4), 1.0, 0.4)
     coloured = augment.colour(window, change)
     assert np.array_equal(coloured.target, change(window.target))

@@ -13,7 +13,7 @@ import yaml
 from forecaster_scenes import TINY
 
 from train.card import __main__ as card
-from train.card import pictures as card_pictures
+from train.card import pictures as card_images
 from train.card import tables as card_tables
 from train.card.__main__ import Card, main, portable, thinned, write_card
 from train.card.pictures import draw_curves, smoothed, stages_of, write_sheet
@@ -43,7 +43,7 @@ SETTINGS: dict[str, Any] = {
 
 
 def prepare(folder: Path, seed: int, begin: float) -> None:
-    """clip.json of a street whose camera drives straight on, STEP metres a frame."""
+    """clip.json of a street whose camera drives straight on, STEP metres per frame."""
     frames, K = [], np.eye(3).tolist()
     for index in range(FRAMES):
         pose = Street.generate(seed).camera_pose(0.0)
@@ -83,8 +83,10 @@ def results(folder: Path, sha256: str) -> Path:
         "machine": {"cores": "3", "processor": "Some CPU", "device": "0:0 Some OpenCL", "date": "2030-01-02T03:04"},
     }
     folder.mkdir()
-    told = as_json(EvaluationResults(PROTOCOLS["street"], records, (1, 2), ("tiny", "rival"), ("It was told.",)), about)
-    (folder / "results.json").write_text(json.dumps(told))
+    reported = as_json(
+        EvaluationResults(PROTOCOLS["street"], records, (1, 2), ("tiny", "rival"), ("It was reported.",)), about
+    )
+    (folder / "results.json").write_text(json.dumps(reported))
     noise = np.random.default_rng(0).integers(0, 256, (500, 1200, 3), np.uint8)
     for word in ("best", "worst"):
         write_pixels(folder / f"sheet_{word}.png", noise)
@@ -120,10 +122,10 @@ def test_every_file_is_there(options: Card, text: str) -> None:
     assert yaml.safe_load(head)["license"] == "apache-2.0" and yaml.safe_load(head)["library_name"] == "vestcl"
     assert body.startswith("\n# vest-x\n") and "{{" not in text and "}}" not in text
     assert "![best window](unseen_best.jpg)" in text and "median window" not in text
-    assert all((options.out / name).stat().st_size <= card_pictures.SHEET_BYTES for name in names if "jpg" in name)
+    assert all((options.out / name).stat().st_size <= card_images.SHEET_BYTES for name in names if "jpg" in name)
 
 
-def test_the_model_is_told_by_its_file(options: Card, text: str) -> None:
+def test_the_model_is_identified_by_its_file(options: Card, text: str) -> None:
     file = checkpoint.list_checkpoints(options.run)[0] / "ema.safetensors"
     model = Forecaster.load(file)
     count = sum(parameter.numel() for parameter in model.parameters())
@@ -133,7 +135,7 @@ def test_the_model_is_told_by_its_file(options: Card, text: str) -> None:
 
 
 def test_data_by_hand(text: str) -> None:
-    """Three clips of 6 frames; with targets up to t+2 each has t = 1, 2, 3. 0.8 m at 10 frames a second is 8 m/s."""
+    """Three clips of 6 frames; with targets up to t+2 each has t = 1, 2, 3. 0.8 m at 10 frames per second is 8 m/s."""
     assert "| pose, all | `streets` | 3 | 18 | 9 | 48 x 160 | 7-8, 10 | 8.0 to 8.0 | 0.0 to 0.0 |" in text
     assert "Targets: t+1 75%, t+2 25%, 50% of them from the right camera" in text
 
@@ -153,7 +155,7 @@ def test_results_by_hand(text: str) -> None:
     assert "| PSNR t+1 | 21.00 [20.00, 22.00] | 22.50 [21.00, 24.00] | +1.50 [+1.00, +2.00], 100% |" in text
     assert "| PSNR t+2 | 17.00 [16.00, 18.00] | 18.50 [17.00, 20.00] | +1.50 [+1.00, +2.00], 100% |" in text
     assert "| turn t+2 | 0.300 [0.300, 0.300] | 0.200 [0.200, 0.200] | -0.100 [-0.100, -0.100], 100% |" in text
-    assert "t+3 |" not in text and "rival" not in text and "It was told." in text
+    assert "t+3 |" not in text and "rival" not in text and "It was reported." in text
     assert "2 windows of 2 clips, seeds 0 to 1, 48 x 160 px" in text
 
 
@@ -165,9 +167,11 @@ def test_commands_are_of_what_was_done(text: str) -> None:
     assert f"python -m train.evaluate street --model ema.safetensors {settings} --squeeze WEIGHTS\n" in text
 
 
-def test_what_the_author_tells_is_taken(options: Card, tmp_path: Path) -> None:
-    told = dataclasses.replace(options, results=(), out=tmp_path, prepare=("vestcl prepare mine",), machine="a machine")
-    write_card(told)
+def test_what_the_author_writes_is_taken(options: Card, tmp_path: Path) -> None:
+    reported = dataclasses.replace(
+        options, results=(), out=tmp_path, prepare=("vestcl prepare mine",), machine="a machine"
+    )
+    write_card(reported)
     text = (tmp_path / "README.md").read_text()
     assert "vestcl prepare mine\n" in text and "street:7-8" not in text and "Machine: a machine.\n" in text
     assert "None yet." in text and "train.evaluate" not in text
@@ -183,8 +187,8 @@ def test_steps_after_the_checkpoint_are_left_out(options: Card, tmp_path: Path) 
 
 
 def test_config_and_log_can_be_read_again(options: Card, text: str, tmp_path: Path) -> None:
-    told = yaml.safe_load((options.out / "config.yaml").read_text())
-    assert told["data"]["train"] == ["streets"] and told["out"] == "run"
+    reported = yaml.safe_load((options.out / "config.yaml").read_text())
+    assert reported["data"]["train"] == ["streets"] and reported["out"] == "run"
     again = load_config(options.out / "config.yaml", [f"out={tmp_path}"])
     assert [stage.steps for stage in again.stages] == [40, 60]
     assert (options.out / LOG).read_text() == (options.run / LOG).read_text()
@@ -198,7 +202,7 @@ def test_a_long_log_is_thinned_to_its_end() -> None:
     assert thinned(rows, 1000) == rows and len(thinned(rows, 300)) > 200
 
 
-def test_no_folder_of_this_machine_is_told() -> None:
+def test_no_folder_of_this_machine_is_reported() -> None:
     given = {"a": ["/x/y/cache", "rel/ative", 3, None], "b": {"c": Path("/x").joinpath("w.npz").as_posix()}}
     assert portable(given) == {"a": ["cache", "rel/ative", 3, None], "b": {"c": "w.npz"}}
 
@@ -265,7 +269,7 @@ def test_stages_follow_each_other() -> None:
 
 
 def test_curves_are_drawn_of_what_there_is(tmp_path: Path) -> None:
-    """A value that was no number (null) and one row alone are no reason to fail; curves change the picture."""
+    """A value that was not finite (null) and one row alone are no reason to fail; curves change the image."""
     rows = log()
     draw_curves(tmp_path / "a.png", rows)
     rows[5] = {**rows[5], "l1": None, "loss": 5.0}

@@ -69,7 +69,7 @@ def test_the_models_files_are_models(tmp_path: Path) -> None:
         assert again.equal(model(*frames).views[0].image)
 
 
-def test_adam_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+def test_adam_continues_to_the_same_bits(tmp_path: Path) -> None:
     """Two steps, a checkpoint, two steps: as four without one, dropout's generator included."""
 
     def build() -> tuple[Any, Any, Any]:

@@ -17,7 +17,7 @@ from train.run.checkpoint import load_latest, save
 
 ROOT = Path(__file__).resolve().parents[2]
 
-#: Saves a state of some 20 MB again and again, and tells each step before it begins and after it is done.
+#: Saves a state of some 20 MB again and again, and reports each step before it begins and after it is done.
 SAVES_FOREVER = """
 import itertools, sys, torch
 from forecaster_scenes import TINY
@@ -132,7 +132,7 @@ def wait_for_a_beginning(process: subprocess.Popen[str], folder: Path) -> None:
 
 
 def test_kill_in_the_middle_of_saving_leaves_a_loadable_state(tmp_path: Path) -> None:
-    """At random moments; whatever was told to be done is there, and what was cut off is cleaned up by the next."""
+    """At random moments; whatever was reported as done is there, and what was cut off is cleaned up by the next."""
     moments, first, cut = random.Random(0), 0, 0
     for _ in range(4):
         process = child(SAVES_FOREVER, tmp_path, first)
@@ -140,10 +140,10 @@ def test_kill_in_the_middle_of_saving_leaves_a_loadable_state(tmp_path: Path) ->
         time.sleep(moments.uniform(0, 0.05))
         process.send_signal(signal.SIGKILL)
         assert process.stdout is not None
-        told = process.stdout.read().split()
+        reported = process.stdout.read().split()
         process.stdout.close()
         process.wait(60)
-        done = [first, *(int(step) for word, step in zip(told[::2], told[1::2], strict=True) if word == "done")]
+        done = [first, *(int(step) for word, step in zip(reported[::2], reported[1::2], strict=True) if word == "done")]
         cut += bool(list((tmp_path / "checkpoints").glob(".*")))
         with warnings.catch_warnings():
             warnings.simplefilter("error")

@@ -21,7 +21,7 @@ from vestcl.data.readers.splits import (
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "train" / "configs").glob("*.yaml"))
 
-#: What shipped files may leave open; each tells in its first lines what it does.
+#: What shipped files may leave open; each says in its first lines what it does.
 OPEN = ("out=runs/a", "data.train=[prepared/*]", "loss.perceptual.weights=trunk.pth")
 
 #: Frames of the left camera in KITTI raw's city drives, by day and number.
@@ -118,12 +118,12 @@ def test_the_last_override_counts(small: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("data.horizon=[1]", "`data.horizon` is no key; did you mean `data.horizons`?"),
-        ("sede=1", "`sede` is no key; did you mean `seed`?"),
-        ("stages.1.learning_rat=1", "`stages.1.learning_rat` is no key; did you mean `stages.1.learning_rate`?"),
-        ("optimizer.ema=0.9", "`optimizer` is no key; did you mean `optimiser`?"),
-        ("warm_up=3", "`warm_up` is no key; did you mean `stages.warm_up`?"),
-        ("xyzzy=1", "`xyzzy` is no key"),
+        ("data.horizon=[1]", "`data.horizon` is not a key; did you mean `data.horizons`?"),
+        ("sede=1", "`sede` is not a key; did you mean `seed`?"),
+        ("stages.1.learning_rat=1", "`stages.1.learning_rat` is not a key; did you mean `stages.1.learning_rate`?"),
+        ("optimizer.ema=0.9", "`optimizer` is not a key; did you mean `optimiser`?"),
+        ("warm_up=3", "`warm_up` is not a key; did you mean `stages.warm_up`?"),
+        ("xyzzy=1", "`xyzzy` is not a key"),
         ("data.train=null", "`data.train` must be set: add data.train=..."),
         ("data.train=[]", "`data`: `train` must name a folder or more, got none"),
         ("out=null", "`out` must be set: add out=..."),
@@ -155,7 +155,9 @@ def test_what_is_wrong_is_said(small: Path, override: str, words: str) -> None:
 def test_everything_that_is_wrong_is_in_one_message(small: Path) -> None:
     message = error_of(small, "out=null", "data.color=0.1", "stages.0.steps=-1")
     assert message.startswith(f"{small} with out=null")
-    assert all(key in message for key in ("`out`", "`data.color` is no key; did you mean `data.colour`?", "`stages.0"))
+    assert all(
+        key in message for key in ("`out`", "`data.color` is not a key; did you mean `data.colour`?", "`stages.0")
+    )
     assert len(message.splitlines()) == 4
 
 
@@ -231,10 +233,10 @@ def test_every_shipped_one_loads_once_what_it_leaves_open_is_set(path: Path) -> 
     config = load_config(path, OPEN)
     assert config.name == path.stem and path.stem.startswith((config.model, "ablation"))
     assert isinstance(config, Config) and from_dict(json.loads(json.dumps(to_dict(config)))) == config
-    told = "".join(line for line in path.read_text().splitlines(keepends=True) if line.startswith("#"))
+    reported = "".join(line for line in path.read_text().splitlines(keepends=True) if line.startswith("#"))
     for number in range(len(OPEN)):
         key, others = OPEN[number].partition("=")[0], (*OPEN[:number], *OPEN[number + 1 :])
-        if re.search(rf"(?<![\w-]){re.escape(key)}\b", told):
+        if re.search(rf"(?<![\w-]){re.escape(key)}\b", reported):
             assert key in error_of(path, *others)
         else:
             assert load_config(path, others).name == path.stem

@@ -192,13 +192,13 @@ def test_ranks_share_the_batch_of_one_process(clips: list[PreparedClip]) -> None
 
 def test_a_worker_reads_what_the_process_itself_reads(clips: list[PreparedClip]) -> None:
     windows = WindowSet(clips, **VARIED)
-    alone, helped = (list(loader(windows, 7, 2, range(2, 4), workers=workers)) for workers in (0, 1))
-    for one, other in zip(alone, helped, strict=True):
+    single, helped = (list(loader(windows, 7, 2, range(2, 4), workers=workers)) for workers in (0, 1))
+    for one, other in zip(single, helped, strict=True):
         assert_same(one, other)
     assert isinstance(helped[0], Batch) and isinstance(helped[0].clips, tuple)
 
 
-def test_reading_leaves_the_global_generators_alone(clips: list[PreparedClip]) -> None:
+def test_reading_leaves_the_global_generators_unchanged(clips: list[PreparedClip]) -> None:
     torch_before, numpy_before = torch.get_rng_state(), pickle.dumps(np.random.get_state())  # noqa: NPY002
     list(loader(WindowSet(clips, **VARIED), 7, 2, range(2)))
     assert torch.equal(torch.get_rng_state(), torch_before)

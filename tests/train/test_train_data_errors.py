@@ -38,7 +38,7 @@ def test_too_short_clips_say_how_many_frames_are_needed() -> None:
     ],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the message is compared as it stands
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the message is compared as it is
         fakes(6, **settings)
     assert message in str(caught.value)
 

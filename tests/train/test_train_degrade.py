@@ -143,7 +143,7 @@ def test_draws_follow_the_settings_and_the_seed() -> None:
     assert degrade.draw(rng(), DegradeConfig(share=0.0)) is None
 
 
-def test_batches_are_degraded_alike_again_and_only_if_asked_for(clips: list[PreparedClip]) -> None:
+def test_batches_are_degraded_equally_again_and_only_if_asked_for(clips: list[PreparedClip]) -> None:
     always = DegradeConfig(share=1.0)
     plain, one, other = (WindowSet(clips, degrade=settings) for settings in (None, always, always))
     draws = plain.global_batch(4, 0, 4)
@@ -160,8 +160,8 @@ def test_batches_are_degraded_alike_again_and_only_if_asked_for(clips: list[Prep
 
 
 def test_folders_are_mixed_by_weight(cache: Path) -> None:
-    usual, road = str(cache / "usual"), str(cache / "road")
-    data = DataConfig(train=(usual, road), weights=((usual, 0.25), (road, 0.75)))
+    straight, road = str(cache / "usual"), str(cache / "road")
+    data = DataConfig(train=(straight, road), weights=((straight, 0.25), (road, 0.75)))
     windows = window_set(data)
     draws = [draw for step in range(50) for draw in windows.global_batch(1, step, 8)]
     counts = Counter(windows.clips[draw.clip].folder.parent.name for draw in draws)

@@ -1,4 +1,4 @@
-"""train.evaluate: whole runs on tiny streets and on a tiny tree of KITTI raw, what they keep, and what they tell."""
+"""train.evaluate: whole runs on tiny streets and on a tiny tree of KITTI raw, what they keep, and what they report."""
 
 import csv
 import json
@@ -63,67 +63,67 @@ def run(**settings: Any) -> dict[str, Any]:
     config = Evaluation(**settings)
     evaluate.evaluate(config)
     assert config.out is not None
-    told: dict[str, Any] = json.loads((config.out / "results.json").read_text(encoding="utf-8"))
-    return told
+    reported: dict[str, Any] = json.loads((config.out / "results.json").read_text(encoding="utf-8"))
+    return reported
 
 
-def scores(told: dict[str, Any]) -> list[tuple[Any, ...]]:
+def scores(reported: dict[str, Any]) -> list[tuple[Any, ...]]:
     """All but the time it took."""
-    rows = [(w["clip"], w["index"], w["view"], w["method"], w["scores"]) for w in told["windows"]]
+    rows = [(w["clip"], w["index"], w["view"], w["method"], w["scores"]) for w in reported["windows"]]
     return sorted(rows, key=lambda row: row[:4])
 
 
 def test_a_run_measures_every_method(whole: tuple[dict[str, Any], Path]) -> None:
-    told, _ = whole
+    reported, _ = whole
     methods = {REPEAT, FLOW, GEOMETRIC, "tiny"}
-    assert set(told["summary"]) == {"source", "right", CAMERA}
-    assert set(told["summary"]["source"]) == methods
+    assert set(reported["summary"]) == {"source", "right", CAMERA}
+    assert set(reported["summary"]["source"]) == methods
     left = {REPEAT + OTHER_CAMERA, FLOW + OTHER_CAMERA}
-    assert set(told["summary"]["right"]) == {GEOMETRIC, "tiny", ORACLE} | left
-    assert set(told["summary"][CAMERA]) == {CONSTANT_VELOCITY, "tiny"}
-    assert set(told["clips"]) == {"street 3", "street 4", "street 5"}
-    own = [w["scores"]["psnr"] for w in told["windows"] if (w["view"], w["method"]) == ("source", GEOMETRIC)]
-    found = told["summary"]["source"][GEOMETRIC]
+    assert set(reported["summary"]["right"]) == {GEOMETRIC, "tiny", ORACLE} | left
+    assert set(reported["summary"][CAMERA]) == {CONSTANT_VELOCITY, "tiny"}
+    assert set(reported["clips"]) == {"street 3", "street 4", "street 5"}
+    own = [w["scores"]["psnr"] for w in reported["windows"] if (w["view"], w["method"]) == ("source", GEOMETRIC)]
+    found = reported["summary"]["source"][GEOMETRIC]
     np.testing.assert_allclose(found["by_horizon"]["psnr"], np.mean(own, axis=0))
     np.testing.assert_allclose(found["running_mean"]["psnr"], [np.mean(own, axis=0)[0], np.mean(own)])
-    assert found["by_horizon"]["psnr"][0] > told["summary"]["source"][REPEAT]["by_horizon"]["psnr"][0]
-    interval = told["intervals"]["source"][GEOMETRIC]["psnr"][0]
+    assert found["by_horizon"]["psnr"][0] > reported["summary"]["source"][REPEAT]["by_horizon"]["psnr"][0]
+    interval = reported["intervals"]["source"][GEOMETRIC]["psnr"][0]
     assert interval["low"] < interval["mean"] < interval["high"]
     assert interval["mean"] == pytest.approx(found["by_horizon"]["psnr"][0])
-    difference = told["differences"]["source"]["tiny"]["psnr"][0]
-    tiny = told["summary"]["source"]["tiny"]["by_horizon"]["psnr"][0]
+    difference = reported["differences"]["source"]["tiny"]["psnr"][0]
+    tiny = reported["summary"]["source"]["tiny"]["by_horizon"]["psnr"][0]
     assert difference["mean"] == pytest.approx(tiny - interval["mean"]) and difference["better"] == 0
-    assert told["models"]["tiny"]["sha256"] and {"device", "torch", "vestcl"} <= set(told["machine"])
-    assert "Depth is from the street itself, true, masks are from labels." in told["notes"]
-    assert told["models"]["tiny"]["mode"] == "feedback"  # it starts from rest
+    assert reported["models"]["tiny"]["sha256"] and {"device", "torch", "vestcl"} <= set(reported["machine"])
+    assert "Depth is from the street itself, true, masks are from labels." in reported["notes"]
+    assert reported["models"]["tiny"]["mode"] == "feedback"  # it starts from rest
 
 
-def test_the_files_tell_the_same(whole: tuple[dict[str, Any], Path]) -> None:
-    told, out = whole
+def test_the_files_contain_the_same(whole: tuple[dict[str, Any], Path]) -> None:
+    reported, out = whole
     with (out / "results.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == sum(len(next(iter(w["scores"].values()))) for w in told["windows"])
+    assert len(rows) == sum(len(next(iter(w["scores"].values()))) for w in reported["windows"])
     for row in rows:
-        (window,) = [w for w in told["windows"] if all(w[k] == row[k] for k in ("clip", "view", "method"))]
+        (window,) = [w for w in reported["windows"] if all(w[k] == row[k] for k in ("clip", "view", "method"))]
         for name, values in window["scores"].items():
             value = values[int(row["horizon"]) - 1]
             assert float(row[name]) == value if value is not None else row[name] in ("nan", "inf")
     text = (out / "results.md").read_text(encoding="utf-8")
-    best = told["summary"]["source"]["tiny"]["by_horizon"]["psnr"]
+    best = reported["summary"]["source"]["tiny"]["by_horizon"]["psnr"]
     assert f"| tiny | {best[0]:.2f} | {best[1]:.2f} |" in text
     assert ", mode feedback" in text and text.count("Mode of later frames: tiny feedback.") >= 6
     assert "view source, model less geometric" in text and "view camera, model less constant velocity" in text
     assert "by clip" in text and "| street 4 | 1 |" in text and "LPIPS (--lpips), ST-LPIPS (--st-lpips)" in text
     sheets = [read_pixels(out / f"sheet_{word}.png") for word in ("best", "median", "worst")]
     assert {sheet.shape for sheet in sheets} == {sheets[0].shape}
-    assert sheets[0].shape[0] > 2 * SIZE[0] and sheets[0].shape[1] > 5 * SIZE[1]  # two steps, five pictures each
+    assert sheets[0].shape[0] > 2 * SIZE[0] and sheets[0].shape[1] > 5 * SIZE[1]  # two steps, five images each
     assert not np.array_equal(sheets[0], sheets[2])
 
 
 def test_what_is_done_is_not_done_again(
     whole: tuple[dict[str, Any], Path], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run that dies in its second clip, and goes on: the same scores, and the first clip is not looked at again."""
+    """A run that dies in its second clip, and continues: the same scores, and the first clip is not looked at again."""
     original, seen = evaluate_windows.window, list[str]()
 
     def window(perception: Any, truth: Any, *arguments: Any) -> Any:
@@ -166,7 +166,7 @@ def test_another_model_is_another_evaluation(tmp_path: Path) -> None:
     assert len(list((tmp_path / "out" / "clips").iterdir())) == 2
 
 
-def test_a_part_that_holds_something_else_is_told(tmp_path: Path) -> None:
+def test_a_part_that_holds_something_else_is_reported(tmp_path: Path) -> None:
     settings = {**STREETS, "seeds": (3, 3), "out": tmp_path, "sheets": False}
     run(**settings)
     (kept,) = (tmp_path / "clips").iterdir()
@@ -181,32 +181,32 @@ def test_a_part_that_holds_something_else_is_told(tmp_path: Path) -> None:
 def test_the_papers_protocol_on_kitti(tmp_path: Path, model: Path) -> None:
     data = drives(tmp_path / "kitti", KITTI_PREDICTION_TEST)
     settings = {"data": data, "height": SIZE[0], "width": SIZE[1], "steps": 3, "model": (model,), "sheets": False}
-    told = run(protocol="kitti-space-time", out=tmp_path / "out", **settings)
-    assert set(told["clips"]) == set(KITTI_PREDICTION_TEST) and set(told["summary"]) == {"right"}
-    assert told["summary"]["right"]["tiny"]["windows"] == 4
-    assert len(told["summary"]["right"]["tiny"]["by_horizon"]["ssim"]) == 3
-    of_right = {name: of["by_horizon"]["ssim"][0] for name, of in told["summary"]["right"].items()}
+    reported = run(protocol="kitti-space-time", out=tmp_path / "out", **settings)
+    assert set(reported["clips"]) == set(KITTI_PREDICTION_TEST) and set(reported["summary"]) == {"right"}
+    assert reported["summary"]["right"]["tiny"]["windows"] == 4
+    assert len(reported["summary"]["right"]["tiny"]["by_horizon"]["ssim"]) == 3
+    of_right = {name: of["by_horizon"]["ssim"][0] for name, of in reported["summary"]["right"].items()}
     assert of_right[GEOMETRIC + PAIR] > max(of_right[GEOMETRIC], of_right[REPEAT + OTHER_CAMERA])
     assert of_right["tiny"] != of_right["tiny" + PAIR]
-    assert set(told["differences"]["right"]) == {"tiny", "tiny" + PAIR}
+    assert set(reported["differences"]["right"]) == {"tiny", "tiny" + PAIR}
     text = (tmp_path / "out" / "results.md").read_text(encoding="utf-8")
     assert f"model less {GEOMETRIC}**" in text and f"model less {GEOMETRIC}{PAIR}**" in text
-    paper = [row for row in told["paper"] if (row["method"], row["metric"]) == ("the paper", "ms_ssim")]
+    paper = [row for row in reported["paper"] if (row["method"], row["metric"]) == ("the paper", "ms_ssim")]
     assert len(paper) == 1 and f"| {paper[0]['values']['1']:.3f} |" in text.replace(" | ", " | ")
     assert 'Depth is from motion and from the stereo pair at t-1 and t (rows ending in "stereo pair")' in text
-    assert "MS-SSIM needs 176 pixels a side, got 48 x 160." in text
+    assert "MS-SSIM needs 176 pixels per side, got 48 x 160." in text
     assert "Not the published protocol: size (48, 160), steps 3." in text
 
 
 def test_the_present_from_the_right(tmp_path: Path, model: Path) -> None:
     data = drives(tmp_path / "kitti", KITTI_VIEWS_TEST)
     settings = {"data": data, "height": SIZE[0], "width": SIZE[1], "steps": 3, "model": (model,), "sheets": False}
-    told = run(protocol="kitti-space", out=tmp_path / "out", **settings)
-    present = told["summary"][NOW]
+    reported = run(protocol="kitti-space", out=tmp_path / "out", **settings)
+    present = reported["summary"][NOW]
     assert set(present) == {AS_SEEN, GEOMETRIC, "tiny"} and len(present[GEOMETRIC]["by_horizon"]["ssim"]) == 1
     assert present[GEOMETRIC]["by_horizon"]["psnr"][0] > present[AS_SEEN]["by_horizon"]["psnr"][0]
-    assert "tiny" in told["summary"]["source"]
-    assert not any("Mode compose" in note for note in told["notes"])
+    assert "tiny" in reported["summary"]["source"]
+    assert not any("Mode compose" in note for note in reported["notes"])
     text = (tmp_path / "out" / "results.md").read_text(encoding="utf-8")
     assert "view right at t" in text and "Depth is from motion, masks are from motion." in text
     assert "compute_scores.py): the outer 5 % of each side are black" in text
@@ -233,15 +233,15 @@ def test_training_on_what_is_evaluated_is_named(tmp_path: Path) -> None:
         write_checkpoint(tmp_path / f"{name}.safetensors", model.config, model.state_dict(), shown)
     models = tuple(tmp_path / f"{name}.safetensors" for name in ("prediction", "views"))
     settings = {"data": data, "height": SIZE[0], "width": SIZE[1], "steps": 1, "model": models, "sheets": False}
-    told = run(protocol="kitti-space", out=tmp_path / "out", **settings)
+    reported = run(protocol="kitti-space", out=tmp_path / "out", **settings)
     drive = "2011_09_26_drive_{}_sync".format
     line = f"prediction was trained on frames of 3 of these 4 clips: {', '.join(map(drive, ('0001', '0057', '0106')))}."
-    assert line in told["notes"] and not any("views was trained" in note for note in told["notes"])
+    assert line in reported["notes"] and not any("views was trained" in note for note in reported["notes"])
     text = (tmp_path / "out" / "results.md").read_text(encoding="utf-8")
     tables = [
         part
         for part in text.split("\n**")
-        if part.startswith("KITTI") and not part.startswith(f"{told['title']}, the paper")
+        if part.startswith("KITTI") and not part.startswith(f"{reported['title']}, the paper")
     ]
     assert tables and all(line in table for table in tables)
 
@@ -285,12 +285,12 @@ def test_each_model_makes_later_frames_as_it_is_meant_to(tmp_path: Path) -> None
         ({"first": 9, "last": 3}, "must have 12 frames and a window"),
     ],
 )
-def test_what_cannot_be_is_told(settings: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_what_cannot_be_is_reported(settings: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         evaluate.evaluate(Evaluation(**({**STREETS, "out": tmp_path} | settings)))
 
 
-def test_the_command_line_tells_errors_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_reports_errors_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["street", "--model", str(tmp_path / "none.safetensors")]) == 2
     assert "error: no model at" in capsys.readouterr().err
 
@@ -310,12 +310,12 @@ def test_st_lpips_and_the_peer_come_by_file(tmp_path: Path) -> None:
     torch.save(public_state(), tmp_path / "st.pth")
     VoxelFlowNetwork(blocks=[(4, 8), (1, 4)]).save(tmp_path / "flow.safetensors")
     settings = {**STREETS, "seeds": (3, 3), "steps": 1, "horizons": (1,), "sheets": False, "out": tmp_path / "out"}
-    told = run(**settings, st_lpips=tmp_path / "st.pth", peer=tmp_path / "flow.safetensors")
-    assert set(told["weights"]) == {"peer", "st_lpips"} and "peer" not in told["settings"]
-    assert set(told["summary"]["source"]) == {REPEAT, FLOW, GEOMETRIC, peer.METHOD}
-    assert peer.METHOD in told["summary"]["right"] and peer.METHOD not in told["summary"][CAMERA]
-    assert all(method["by_horizon"]["st_lpips"][0] > 0 for method in told["summary"]["source"].values())
-    (note,) = [line for line in told["notes"] if line.startswith(f"{peer.METHOD} (flow.safetensors): ")]
+    reported = run(**settings, st_lpips=tmp_path / "st.pth", peer=tmp_path / "flow.safetensors")
+    assert set(reported["weights"]) == {"peer", "st_lpips"} and "peer" not in reported["settings"]
+    assert set(reported["summary"]["source"]) == {REPEAT, FLOW, GEOMETRIC, peer.METHOD}
+    assert peer.METHOD in reported["summary"]["right"] and peer.METHOD not in reported["summary"][CAMERA]
+    assert all(method["by_horizon"]["st_lpips"][0] > 0 for method in reported["summary"]["source"].values())
+    (note,) = [line for line in reported["notes"] if line.startswith(f"{peer.METHOD} (flow.safetensors): ")]
     assert note.endswith("with the geometric forecast's depth.")
     files = list((tmp_path / "out" / "clips").iterdir())
     run(**settings, peer=tmp_path / "flow.safetensors")

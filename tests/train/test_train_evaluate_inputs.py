@@ -107,7 +107,7 @@ def test_labels() -> None:
 
 @pytest.mark.parametrize("name", ["kitti-space", "kitti-space-val"])
 def test_the_answer_is_not_seen(clip: Clip, name: Name) -> None:
-    """The right camera's image at t is drawn without it: whatever that camera sees, the picture is the same."""
+    """The right camera's image at t is drawn without it: whatever that camera sees, the image is the same."""
     shown, made = [], []
     for seen in (without_depth(clip), with_other_right(without_depth(clip))):
         (perception,) = perceptions_of(seen, setup(name)).values()

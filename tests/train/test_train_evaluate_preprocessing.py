@@ -104,25 +104,25 @@ def test_estimators_replace_the_clips_own(
     """Both are named in every table, printed or written, and in results.json; recursion uses them by default."""
     model, plain = model_file(tmp_path / "tiny.safetensors"), run(**ONE, out=tmp_path / "plain")
     capsys.readouterr()
-    told = run(**ONE, model=(model,), depth_model="a/depth", mask_model="b/classes", out=tmp_path / "out")
+    reported = run(**ONE, model=(model,), depth_model="a/depth", mask_model="b/classes", out=tmp_path / "out")
     assert estimators.loaded == ["a/depth", "b/classes"]
     known = "Depth is from the estimator a/depth, masks are from the classes of b/classes."
     motion = f"Camera motion up to t is from optical flow and depth, inpainting is by {DEFAULT}."
     perceive = "Depth and masks of forecast frames (perceive): tiny estimated."
-    assert known in told["notes"] and motion in told["notes"]
-    (by_label,) = told["inputs"].values()
+    assert known in reported["notes"] and motion in reported["notes"]
+    (by_label,) = reported["inputs"].values()
     assert by_label == {
         "": {
             "depth": "the estimator a/depth", "masks": "the classes of b/classes", "motion": "optical flow and depth",
             "inpainting": DEFAULT, "stereo": False,
         }
     }  # fmt: skip
-    assert (told["models"]["tiny"]["mode"], told["models"]["tiny"]["perceive"]) == ("feedback", "estimated")
+    assert (reported["models"]["tiny"]["mode"], reported["models"]["tiny"]["perceive"]) == ("feedback", "estimated")
     written = tables(tmp_path / "out")
     assert len(written) > 3 and all(known in table and motion in table and perceive in table for table in written)
     printed = capsys.readouterr().out
     assert printed.count(known) == printed.count(perceive) >= 3
-    before, after = (each["summary"]["source"][GEOMETRIC]["by_horizon"]["psnr"][0] for each in (plain, told))
+    before, after = (each["summary"]["source"][GEOMETRIC]["by_horizon"]["psnr"][0] for each in (plain, reported))
     assert before > after + 1, "a wall at 7 m is a worse street than the true one"
 
 
@@ -132,7 +132,7 @@ def test_forecast_frames_are_perceived_as_asked(tmp_path: Path, estimators: Esti
     estimated, splatted = (
         run(**settings, perceive=perceive, out=tmp_path / perceive) for perceive in ("estimated", "splatted")
     )
-    (one, other) = (told["summary"]["source"]["tiny"]["by_horizon"]["psnr"] for told in (estimated, splatted))
+    (one, other) = (reported["summary"]["source"]["tiny"]["by_horizon"]["psnr"] for reported in (estimated, splatted))
     assert one[0] == other[0] and one[1] != other[1]
     assert splatted["models"]["tiny"]["perceive"] == "splatted"
     assert "Depth and masks of forecast frames (perceive): tiny splatted." in tables(tmp_path / "splatted")[0]
@@ -170,21 +170,21 @@ def prepare(out: Path, *options: str) -> Path:
 def test_prepared_clips_in_place_of_recorded_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The same scores as when frames are preprocessed here, up to the cache's 8 bits; nothing is preprocessed again."""
     cache, model = prepare(tmp_path / "cache"), model_file(tmp_path / "tiny.safetensors")
-    told, plain = (
+    reported, plain = (
         run(**ONE, model=(model,), out=tmp_path / name, **given)
         for name, given in (("prepared", {"prepared": cache}), ("plain", {}))
     )
-    assert set(told["summary"]["right"]) == set(plain["summary"]["right"])
+    assert set(reported["summary"]["right"]) == set(plain["summary"]["right"])
     for view, method in (("source", GEOMETRIC), ("source", "tiny"), ("right", GEOMETRIC), ("camera", "tiny")):
         metric = "rotation_degrees" if view == "camera" else "psnr"
-        found = [each["summary"][view][method]["by_horizon"] for each in (told, plain)]
+        found = [each["summary"][view][method]["by_horizon"] for each in (reported, plain)]
         metric = metric if metric in found[0] else next(iter(found[0]))
         assert found[0][metric][0] == pytest.approx(found[1][metric][0], rel=0.02), (view, method)
     assert (
-        told["inputs"] == plain["inputs"]
-        and "Depth is from the street itself, true, masks are from labels." in told["notes"]
+        reported["inputs"] == plain["inputs"]
+        and "Depth is from the street itself, true, masks are from labels." in reported["notes"]
     )
-    assert told["weights"]["prepared"]
+    assert reported["weights"]["prepared"]
     assert main(["street", "--prepared", str(cache), "--seeds", "3", "3", "--out", str(tmp_path / "o")]) == 2
     error = capsys.readouterr().err
     assert "--prepared must have street 3 of `vestcl prepare --height 256 --width 832`" in error
@@ -193,9 +193,9 @@ def test_prepared_clips_in_place_of_recorded_ones(tmp_path: Path, capsys: pytest
 def test_prepared_stereo_depth_is_named(tmp_path: Path) -> None:
     """Its rows are labelled; a cache that lists no inputs is refused."""
     cache = prepare(tmp_path / "cache", "--street-depth", "stereo")
-    told = run(**ONE, prepared=cache, out=tmp_path / "out")
-    assert GEOMETRIC + PAIR in told["summary"]["source"] and GEOMETRIC not in told["summary"]["source"]
-    assert 'Depth is from the stereo pair at t-1 and t (rows ending in "stereo pair")' in told["notes"][0]
+    reported = run(**ONE, prepared=cache, out=tmp_path / "out")
+    assert GEOMETRIC + PAIR in reported["summary"]["source"] and GEOMETRIC not in reported["summary"]["source"]
+    assert 'Depth is from the stereo pair at t-1 and t (rows ending in "stereo pair")' in reported["notes"][0]
     (file,) = cache.rglob("clip.json")
     about = json.loads(file.read_text())
     del about["inputs"], about["checksum"]
@@ -214,9 +214,9 @@ def test_prepared_from_the_answer_is_refused(tmp_path: Path, estimators: Estimat
     settings = {"protocol": "kitti-space", "height": SIZE[0], "width": SIZE[1], "steps": 1, "sheets": False}
     with pytest.raises(ValueError, match=r"has depth that was matched against the right camera's image at t, which is"):
         run(**settings, prepared=tmp_path / "pair", out=tmp_path / "out")
-    told = run(**settings, prepared=tmp_path / "estimated", out=tmp_path / "out")
-    assert told["notes"][0] == "Depth is from the estimator a/depth, masks are from the classes of b/classes."
-    assert set(told["clips"]) == set(KITTI_VIEWS_TEST)
+    reported = run(**settings, prepared=tmp_path / "estimated", out=tmp_path / "out")
+    assert reported["notes"][0] == "Depth is from the estimator a/depth, masks are from the classes of b/classes."
+    assert set(reported["clips"]) == set(KITTI_VIEWS_TEST)
 
 
 @pytest.mark.parametrize(
@@ -257,12 +257,12 @@ def test_accumulated_depth_is_asked_for_and_named(tmp_path: Path, capsys: pytest
     }
     plain = run(**settings, out=tmp_path / "plain")
     assert plain["notes"][0] == "Depth is from motion, masks are from motion."
-    told = run(**settings, accumulated_depth=True, out=tmp_path / "out")
+    reported = run(**settings, accumulated_depth=True, out=tmp_path / "out")
     words = "KITTI's depth maps, accumulated from scans of frames around each, later ones among them"
     assert all(
         f"Depth is from {words}, where there are any, else motion" in table for table in tables(tmp_path / "out")
     )
-    (before, after) = (each["summary"]["right at t"][GEOMETRIC]["by_horizon"]["psnr"][0] for each in (plain, told))
+    (before, after) = (each["summary"]["right at t"][GEOMETRIC]["by_horizon"]["psnr"][0] for each in (plain, reported))
     assert after > before
     assert main(["street", "--accumulated-depth", "--out", str(tmp_path / "street")]) == 2
     assert "--accumulated-depth is of KITTI raw" in capsys.readouterr().err
@@ -275,12 +275,12 @@ def test_accumulated_depth_is_asked_for_and_named(tmp_path: Path, capsys: pytest
 def test_lama_reaches_every_command(tmp_path: Path, lama: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Evaluation, caches and forecasts: other colours behind what moves, and the method is named."""
     model = model_file(tmp_path / "tiny.safetensors")
-    told, plain = (
+    reported, plain = (
         run(**{**ONE, "steps": 2}, model=(model,), out=tmp_path / name, inpaint=inpaint)
         for name, inpaint in (("lama", lama), ("plain", None))
     )
-    assert f"Camera motion up to t is from optical flow and depth, inpainting is by {lama}." in told["notes"]
-    one, other = (each["summary"]["source"]["tiny"]["by_horizon"]["psnr"] for each in (told, plain))
+    assert f"Camera motion up to t is from optical flow and depth, inpainting is by {lama}." in reported["notes"]
+    one, other = (each["summary"]["source"]["tiny"]["by_horizon"]["psnr"] for each in (reported, plain))
     assert one != other
     caches = [prepare(tmp_path / name, *options) for name, options in (("a", ["--inpaint", lama]), ("b", []))]
     clips = [PreparedClip.open(next(cache.rglob("clip.json")).parent) for cache in caches]

@@ -80,19 +80,19 @@ def test_the_camera_is_held_against_constant_velocity() -> None:
     assert found.rows == (("ours, path", "-1.00 [-1.00, -1.00], 100%", "+1.00 [+1.00, +1.00], 0%"),)
 
 
-def test_one_clip_is_told_to_doubt() -> None:
+def test_one_clip_is_marked_as_doubtful() -> None:
     made = grids(EvaluationResults(PROTOCOLS["clip"], [record(GEOMETRIC, "a", [0.5])], (1,), ()))
     (interval,) = [grid for grid in made if "interval" in grid.title]
     assert "too narrow" in interval.notes[0]
     assert not [grid for grid in made if "by clip" in grid.title]
 
 
-def test_files_hold_the_paper_and_what_was_told() -> None:
+def test_files_hold_the_paper_and_what_was_reported() -> None:
     done = results()
-    told = as_json(done, {"settings": {}})
-    assert told["notes"] == ["Told."] and told["settings"] == {}
-    assert told["clips"]["b"]["source"]["ours"]["by_horizon"]["ms_ssim"][0] == 0.55
-    assert {row["method"] for row in told["paper"]} == {"the paper, space", "the paper, time"}
+    reported = as_json(done, {"settings": {}})
+    assert reported["notes"] == ["Told."] and reported["settings"] == {}
+    assert reported["clips"]["b"]["source"]["ours"]["by_horizon"]["ms_ssim"][0] == 0.55
+    assert {row["method"] for row in reported["paper"]} == {"the paper, space", "the paper, time"}
     text = markdown(done, ["ours: sha256 1234"])
     assert text.startswith(f"# {NAME}\n\n- ours: sha256 1234\n- Told.\n")
     for row in done.protocol.paper:

@@ -73,7 +73,7 @@ def test_scores_are_those_of_the_metrics(tmp_path: Path) -> None:
         assert found.scores[name] == [pytest.approx(float(value), rel=1e-4)], name
 
 
-def test_every_window_tells_how_the_camera_moved() -> None:
+def test_every_window_reports_how_the_camera_moved() -> None:
     clip = street()
     model = stir(Forecaster(TINY)).eval()
     records = window(Perception(clip), Truth(clip, SIZE), 2, setup(models={"tiny": model}))

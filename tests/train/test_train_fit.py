@@ -1,4 +1,4 @@
-"""train.fit: nothing is lost when a run is killed or told to stop, and what breaks is told of."""
+"""train.fit: nothing is lost when a run is killed or asked to stop, and what breaks is reported."""
 
 import dataclasses
 import errno
@@ -83,11 +83,11 @@ def test_killed_at_any_moment_it_comes_to_the_same_weights(
     assert_same_run(out, whole)
 
 
-def test_told_to_stop_it_saves_and_leaves(cache: Path, processes: Processes, whole: Path, tmp_path: Path) -> None:
+def test_asked_to_stop_it_saves_and_leaves(cache: Path, processes: Processes, whole: Path, tmp_path: Path) -> None:
     """Between checkpoints."""
     file, out = str(write_yaml(tmp_path / "run.yaml", cache, tmp_path / "out")), tmp_path / "out"
     assert processes.train(file, moment="SIGTERM update 5") == STOPPED == 143
-    assert steps(out) == [5, 4, 2] and "stopped after step 5; --resume goes on" in processes.output
+    assert steps(out) == [5, 4, 2] and "stopped after step 5; --resume continues" in processes.output
     assert processes.train(file, "--resume") == 0
     assert "from step 5 to step 8" in processes.output
     assert_same_run(out, whole)
@@ -156,13 +156,13 @@ def test_a_finished_run_is_finished(models: None, cache: Path, whole: Path) -> N
 
 
 def test_a_run_is_not_begun_twice(models: None, cache: Path, whole: Path) -> None:
-    with pytest.raises(ValueError, match=r"has a run already: --resume goes on with it, or take another folder"):
+    with pytest.raises(ValueError, match=r"has a run already: --resume continues it, or take another folder"):
         run(cache, whole)
     with pytest.raises(ValueError, match="`seed` was 0, is 1"):
         run(cache, whole, go_on=True, seed=1)
 
 
-def test_the_command_tells_what_is_wrong(
+def test_the_command_reports_what_is_wrong(
     models: None, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = write_yaml(tmp_path / "run.yaml", tmp_path / "nothing", tmp_path / "out")
@@ -334,7 +334,7 @@ def test_an_old_checkpoint_that_stays_ends_no_run(
 
 @pytest.fixture(params=["loss", "gradient"])
 def broken(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, models: None) -> None:
-    """The fourth update's loss, or a gradient of it, is no number."""
+    """The fourth update's loss, or a gradient of it, is not a number."""
     calls = [0]
 
     def total_loss(view: Any, *others: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -356,17 +356,17 @@ def test_no_number_stops(broken: None, cache: Path, tmp_path: Path) -> None:
     shown = ", ".join(windows.label(draw) for draw in windows.global_batch(0, 3, 2))
     with pytest.raises(TrainingError) as error:
         run(cache, tmp_path)
-    told = str(error.value)
-    assert told.startswith("step 4: a loss or gradient is not a number (loss ") and "nan" in told
-    assert f"with {shown}; the last good checkpoint is {tmp_path / 'checkpoints' / 'step-00000002'}" in told
-    assert "`run.on_nan=skip`" in told
+    reported = str(error.value)
+    assert reported.startswith("step 4: a loss or gradient is not a number (loss ") and "nan" in reported
+    assert f"with {shown}; the last good checkpoint is {tmp_path / 'checkpoints' / 'step-00000002'}" in reported
+    assert "`run.on_nan=skip`" in reported
     assert steps(tmp_path) == [2]
 
 
 def test_no_number_is_left_out(broken: None, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The weights and their mean stay for that step, and the run goes on."""
+    """The weights and their mean stay for that step, and the run continues."""
     assert run(cache, tmp_path, run={"on_nan": "skip", "checkpoint_every": 1})
-    assert "step 4: no number, skipped (" in capsys.readouterr().out
+    assert "step 4: non-finite, skipped (" in capsys.readouterr().out
     for name in ("model", "ema"):
         kept = {int(path.name[5:]): Forecaster.load(path / f"{name}.safetensors").state_dict() for path in
                 checkpoint.list_checkpoints(tmp_path)}  # fmt: skip
@@ -397,7 +397,7 @@ def fill_disk(monkeypatch: pytest.MonkeyPatch, full: tuple[int, ...]) -> None:
     monkeypatch.setattr(checkpoint, "write_checkpoint", writing)
 
 
-def test_a_full_disk_is_told_and_training_goes_on(
+def test_a_full_disk_is_reported_and_training_continues(
     models: None, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fill_disk(monkeypatch, (2, 6))

@@ -17,19 +17,19 @@ from vestcl.prepare.clip import prepare_clip
 
 #: dB that are to be reached, and updates that may be spent, 0.09 s each on one core: 36.2 were measured after 700, from
 #: 26.8.
-#: What stands still follows the camera alone, so refinement has to learn most of it.
+#: What is static follows the camera alone, so refinement has to learn most of it.
 WANTED, STEPS = 32.0, 400
 
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Frames t - 1, t and t + 1 of a street, without the steps that one ray a pixel would leave along its edges."""
+    """Frames t - 1, t and t + 1 of a street, without the steps that one ray per pixel would leave along its edges."""
     folder = tmp_path_factory.mktemp("window")
     prepare_clip(street_clip(Street.generate(3), 3, 48, 160, samples=4), folder / "street")
     return folder
 
 
-def test_one_window_is_learnt(cache: Path, tmp_path: Path) -> None:
+def test_one_window_is_learned(cache: Path, tmp_path: Path) -> None:
     """24 x 48 px of it, for two cores' sake, from random weights: all four parts learn, from the image alone."""
     settings = configured(
         cache, tmp_path, model="vest-s",

@@ -126,13 +126,13 @@ def test_a_resumed_run_comes_to_the_same_weights(tmp_path: Path, cache: Path, mo
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("stages.all.step=3", "`stages.0.step` is no key; did you mean `stages.0.steps`"),
+        ("stages.all.step=3", "`stages.0.step` is not a key; did you mean `stages.0.steps`"),
         ("data.right=0.5", r"`data.right` must be 0"),
         ("data.crop=[24, 64]", r"`crop` must be multiples of 16 px, got \[24, 64\]"),
         ("stages.all.crop=[32, 40]", r"`crop` must be multiples of 16 px"),
         ("run.precision=bfloat16", "`run.precision` must be float32"),
         ("stages=[]", "`stages` must be one or more"),
-        ("model=vest-s", "`model` is no key"),
+        ("model=vest-s", "`model` is not a key"),
     ],
 )
 def test_settings_that_cannot_be(override: str, message: str, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ SNIPPETS, CITIES = 500, [f"city-{letter}" for letter in "abcdefghijklmnopqrstuvw
 
 
 def empty_drives(root: Path, frames: Mapping[str, int]) -> Path:
-    """Drives whose first pictures are tiny and whose others are empty: who opens them reads no more."""
+    """Drives whose first images are tiny and whose others are empty: who opens them reads no more."""
     calibration(root)
     for number, count in frames.items():
         for camera in ("02", "03"):
@@ -86,7 +86,7 @@ def test_drives_of_the_pair_in_space_and_in_time(tmp_path: Path) -> None:
     assert count(parts) == sum(n - 8 for n in frames.values())
 
 
-def test_missing_drives_are_told(tmp_path: Path) -> None:
+def test_missing_drives_are_reported(tmp_path: Path) -> None:
     empty_drives(tmp_path, {"0060": 9, "0093": 9})
     with pytest.raises(ValueError, match="without 2011_09_26_drive_0084_sync, 2011_09_26_drive_0096_sync"):
         parts_of("kitti-prediction", tmp_path)
@@ -94,7 +94,7 @@ def test_missing_drives_are_told(tmp_path: Path) -> None:
         parts_of("kitti-prediction", None)
 
 
-def test_clips_without_a_window_are_told(tmp_path: Path) -> None:
+def test_clips_without_a_window_are_reported(tmp_path: Path) -> None:
     data = empty_drives(tmp_path, {"0060": 9, "0084": 9, "0093": 8, "0096": 9})
     with pytest.raises(ValueError, match=r"0093_sync: must have 9 frames and a window .* without a gap, got 8"):
         parts_of("kitti-prediction", data)
@@ -103,14 +103,14 @@ def test_clips_without_a_window_are_told(tmp_path: Path) -> None:
 def test_snippets_of_cityscapes_val(tmp_path: Path) -> None:
     camera = {"intrinsic": {"fx": 2262.5, "fy": 2265.3, "u0": 1096.9, "v0": 513.1}, "extrinsic": {"baseline": 0.2093}}
     write_pixels(tmp_path / "tiny.png", picture(4, 8))
-    tiny, told = (tmp_path / "tiny.png").read_bytes(), json.dumps(camera)
+    tiny, reported = (tmp_path / "tiny.png").read_bytes(), json.dumps(camera)
     for city in CITIES:
         folders = [tmp_path / kind / "val" / city for kind in ("leftImg8bit_sequence", "camera")]
         for folder in folders:
             folder.mkdir(parents=True)
         for sequence in range(SNIPPETS // len(CITIES)):
             stem = f"{city}_{sequence:06}"
-            (folders[1] / f"{stem}_000019_camera.json").write_text(told, encoding="utf-8")
+            (folders[1] / f"{stem}_000019_camera.json").write_text(reported, encoding="utf-8")
             (folders[0] / f"{stem}_000000_leftImg8bit.png").write_bytes(tiny)
             for frame in range(1, 30):
                 (folders[0] / f"{stem}_{frame:06}_leftImg8bit.png").touch()
@@ -120,7 +120,7 @@ def test_snippets_of_cityscapes_val(tmp_path: Path) -> None:
     assert len({part.source.name for part in parts}) == SNIPPETS
 
 
-def test_no_snippets_are_told(tmp_path: Path) -> None:
+def test_no_snippets_are_reported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="leftImg8bit_sequence/val/CITY"):
         parts_of("cityscapes-prediction", tmp_path)
 

@@ -21,7 +21,7 @@ from train.run.trainer import build_model
 from vestcl import opencl
 from vestcl.models import config
 
-#: Two processes' weights beside one's, relative to how far training has moved them. 6e-8 were measured, for the halves
+#: Two processes' weights against one's, relative to how far training has moved them. 6e-8 were measured, for the halves
 #: of a batch of two add up alike; elsewhere rounding may count for more, as Adam divides gradients by their own size.
 TOLERANCE = 1e-3
 
@@ -50,8 +50,8 @@ def one(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of two processes' run."""
     out = tmp_path_factory.mktemp("two") / "out"
-    told = run_both(street(tmp_path_factory), out)
-    assert "to step 8, 2 processes" in told and "from step" not in told
+    reported = run_both(street(tmp_path_factory), out)
+    assert "to step 8, 2 processes" in reported and "from step" not in reported
     return out
 
 
@@ -66,15 +66,15 @@ def run_both(cache: Path, out: Path, moment: str = "") -> str:
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     ) as started:
         try:
-            told, _ = started.communicate(timeout=PATIENCE)
+            reported, _ = started.communicate(timeout=PATIENCE)
         except subprocess.TimeoutExpired:
             started.send_signal(signal.SIGTERM)  # torchrun then ends its processes, which a SIGKILL would leave behind
             raise
-    assert started.returncode == 0, told
-    return told
+    assert started.returncode == 0, reported
+    return reported
 
 
-def test_alone_nothing_is_shared(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_single_process_shares_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("RANK", "WORLD_SIZE", "TORCHELASTIC_RESTART_COUNT"):
         monkeypatch.delenv(name, raising=False)
     ranks = Ranks.join()
@@ -136,8 +136,8 @@ def test_two_processes_reach_the_weights_of_one(one: Path, two: Path, monkeypatc
     monkeypatch.setattr(config, "CONFIGS", MODELS)
     start = flat(build_model(configured(one, one)).state_dict())
     for name in ("model", "ema"):
-        alone, shared = (flat(weights(out, name)) for out in (one, two))
-        assert (shared - alone).norm() < TOLERANCE * (alone - start).norm(), name
+        single, shared = (flat(weights(out, name)) for out in (one, two))
+        assert (shared - single).norm() < TOLERANCE * (single - start).norm(), name
     assert steps(two) == steps(one) == [8, 6, 4, 2]
     rows = read_log(one / LOG), read_log(two / LOG)
     assert [row["step"] for row in rows[1]] == list(range(1, 9))  # the first process alone writes
@@ -150,8 +150,8 @@ def test_started_again_they_reach_the_same_weights(
 ) -> None:
     """The second one is lost after step 5: both go on from step 4, and to the same bits as if nothing had happened."""
     out = tmp_path / "out"
-    told = run_both(street(tmp_path_factory), out, "SIGKILL update 5 1")
-    assert "from step 4 to step 8, 2 processes" in told
+    reported = run_both(street(tmp_path_factory), out, "SIGKILL update 5 1")
+    assert "from step 4 to step 8, 2 processes" in reported
     for name in ("model", "ema"):
         assert torch.equal(flat(weights(out, name)), flat(weights(two, name))), name
     assert [row["step"] for row in read_log(out / LOG)] == list(range(1, 9))

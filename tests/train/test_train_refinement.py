@@ -129,7 +129,7 @@ def test_samples_depend_on_their_number_only(tmp_path: Path, cache: Path) -> Non
     assert planes.shape == (2, 7, 32, 64) and target.shape == (2, 3, 32, 64)
 
 
-def test_planes_and_target_are_varied_alike(tmp_path: Path) -> None:
+def test_planes_and_target_are_varied_equally(tmp_path: Path) -> None:
     """Of a perfect forecast the target is the image, however cut, mirrored and coloured; grey is grey."""
     image = np.random.default_rng(0).integers(0, 256, (3, 40, 80)).astype(np.float32) / 255
     planes = np.concatenate([image, np.ones((4, 40, 80), np.float32)])

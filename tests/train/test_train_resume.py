@@ -1,4 +1,4 @@
-"""What of a configuration may change when a run goes on, and what is said of the rest."""
+"""What of a configuration may change when a run continues, and what is said of the rest."""
 
 import copy
 import dataclasses
@@ -55,7 +55,7 @@ def test_what_may_not(step: int, changes: dict[str, Any], words: str) -> None:
 
 
 def test_keys_that_came_later_have_their_defaults() -> None:
-    """A checkpoint that was written before `loss.routing` and `init_encoder` goes on."""
+    """A checkpoint that was written before `loss.routing` and `init_encoder` continues."""
     state = state_of(12)
     settings = copy.deepcopy(dict(state.config))
     del settings["init_encoder"], settings["loss"]["routing"]

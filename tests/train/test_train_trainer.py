@@ -71,7 +71,7 @@ def test_the_learning_rate_by_hand() -> None:
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_stage_learns_its_parts_alone(part: Any) -> None:
+def test_a_stage_learns_its_parts_only(part: Any) -> None:
     model = Forecaster(SMALL)
     learning = choose_parts(model, Stage("one", steps=1, train=(part,)))
     assert {id(parameter) for parameter in learning} == {id(p) for p in getattr(model, part).parameters()}
@@ -125,15 +125,15 @@ def test_the_running_mean_by_hand() -> None:
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_the_loss_falls_with_each_part_alone(part: str, cache: Path, tmp_path: Path) -> None:
+def test_the_loss_falls_with_each_part_only(part: str, cache: Path, tmp_path: Path) -> None:
     """L1 alone, on one batch; nothing but the part moves."""
     torch.manual_seed(0)
     changes: dict[str, Any] = {"loss": {"ssim": 0.0, "pose": {}}, "optimiser": {"clip_norm": 1.0}}
     settings = one_stage(cache, tmp_path, stage={"train": [part]}, **changes)
     model, batch = stirred(), batch_of(settings)
     before, updates = copy.deepcopy(model.state_dict()), trained(settings, model)
-    told = [updates.update(batch).terms["loss"] for _ in range(20)]
-    assert min(told[-3:]) < told[0]
+    reported = [updates.update(batch).terms["loss"] for _ in range(20)]
+    assert min(reported[-3:]) < reported[0]
     moved = {name for name, value in model.state_dict().items() if not torch.equal(value, before[name])}
     assert moved == {name for name in before if name.startswith(part)}
 
@@ -166,13 +166,13 @@ def test_a_stage_without_rendering_learns_the_camera(cache: Path, tmp_path: Path
     model, batch = stirred(), batch_of(settings)
     updates, painted = trained(settings, model), []
     model.refine.register_forward_hook(lambda *_: painted.append(1))
-    told = [updates.update(batch) for _ in range(20)]
-    assert not painted and told[0].view is None and "l1" not in told[0].terms
-    assert min(each.terms["translation"] for each in told[-3:]) < told[0].terms["translation"]
+    reported = [updates.update(batch) for _ in range(20)]
+    assert not painted and reported[0].view is None and "l1" not in reported[0].terms
+    assert min(each.terms["translation"] for each in reported[-3:]) < reported[0].terms["translation"]
 
 
 def test_the_gradient_is_cut_to_its_norm(cache: Path, tmp_path: Path) -> None:
-    """Adam's first step is the same for any length of the gradient; the norm that is told is the one before the cut."""
+    """Adam's first step is the same for any length of the gradient; the reported norm is the one before the cut."""
     norms, lengths = [], []
     for clip_norm in (None, 1e-3):
         torch.manual_seed(0)
@@ -186,7 +186,7 @@ def test_the_gradient_is_cut_to_its_norm(cache: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("decay", [0.0, 0.1])
-def test_weights_decay_beside_adam(decay: float, cache: Path, tmp_path: Path) -> None:
+def test_weights_decay_with_adam(decay: float, cache: Path, tmp_path: Path) -> None:
     """AdamW: a weight without gradient shrinks by the learning rate times the decay."""
     settings = one_stage(cache, tmp_path, optimiser={"weight_decay": decay})
     model = stirred()

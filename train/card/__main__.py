@@ -19,7 +19,7 @@ import tyro
 import yaml
 from huggingface_hub import ModelCard, ModelCardData
 
-from train.card import pictures as card_pictures
+from train.card import pictures as card_images
 from train.card.pictures import Rows
 from train.card.tables import Weights, about_model, data_table, prepare_commands, result_tables, training_table
 from train.command import ERRORS, failed, warnings_in_lines
@@ -35,7 +35,7 @@ from vestcl.io.atomic import read_bytes, write_bytes
 from vestcl.models.checkpoint import read_checkpoint
 from vestcl.models.shipped import find_model
 
-#: Rows of the log that is kept beside the card: a curve of some hundred pixels has no use for more.
+#: Rows of the log that is kept next to the card: a curve of some hundred pixels has no use for more.
 LOG_ROWS: Final = 300
 
 #: What of a results.json a card is made of.
@@ -62,7 +62,7 @@ class Card:
     run: tyro.conf.Positional[Path]
     """The run's folder."""
     results: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
-    """Folder of `train.evaluate`'s results; more than one may be told. A folder's name names its sheets."""
+    """Folder of `train.evaluate`'s results; may be repeated. A folder's name names its sheets."""
     out: Path = Path("docs/vest-s")
     """The card's folder; its name is the model's."""
     checkpoint: Path | None = None
@@ -70,14 +70,14 @@ class Card:
     horizons: tuple[int, ...] = (1, 3, 5)
     """Steps that tables show, of those that were evaluated."""
     machine: str | None = None
-    """What the run was made on; without it what it was evaluated on is told, as such."""
+    """What the run was made on; without it what it was evaluated on is listed, marked as such."""
     prepare: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A command that prepared data; more than one may be told. Without it they are guessed from the clips."""
+    """A command that prepared data; may be repeated. Without it they are guessed from the clips."""
 
 
 @interrupt.command
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; what a user can put right is told in one line, with exit code 2."""
+    """The command; what a user can put right is reported in one line, with exit code 2."""
     options = command_line.parsed(Card, "python -m train.card", __doc__, arguments)
     with warnings_in_lines():
         try:
@@ -98,7 +98,7 @@ def write_card(options: Card) -> list[Path]:
         The files.
 
     Raises:
-        ValueError: a folder that is no run, data that is not there any more, results of another file, or two folders
+        ValueError: a folder that is not a run, data that is not there any more, results of another file, or two folders
             of results of one name.
         CheckpointError: all of the run's checkpoints are damaged.
         FileNotFoundError: no such model.
@@ -119,10 +119,10 @@ def write_card(options: Card) -> list[Path]:
     }
     for name, text in texts.items():
         write_bytes(out / name, text.encode())
-    card_pictures.draw_curves(out / "curves.png", rows)
+    card_images.draw_curves(out / "curves.png", rows)
     sheets = {out / name: source for name, source in _sheets(results).items()}
     for path, source in sheets.items():
-        card_pictures.write_sheet(path, source)
+        card_images.write_sheet(path, source)
     return [*(out / name for name in texts), out / "curves.png", *sheets]
 
 
@@ -161,12 +161,12 @@ def _weights(path: Path) -> Weights:
 def _results(options: Card, weights: Weights) -> Results:
     found: Results = []
     for folder in options.results:
-        told = _read_results(folder / "results.json")
-        known = {model["sha256"] for model in told["models"].values()}
+        saved = _read_results(folder / "results.json")
+        known = {model["sha256"] for model in saved["models"].values()}
         if weights.sha256 not in known:
             hashes = ", ".join(sorted(sha[:16] for sha in known)) or "no model"
             raise ValueError(f"`results` must be of the file {weights.sha256[:16]}, got {folder} of {hashes}")
-        found.append((folder, told))
+        found.append((folder, saved))
     names = [folder.resolve().name for folder, _ in found]
     if len(set(names)) < len(names):
         raise ValueError(f"`results` must be folders of different names, got {', '.join(names)}")
@@ -175,17 +175,17 @@ def _results(options: Card, weights: Weights) -> Results:
 
 def _read_results(path: Path) -> dict[str, Any]:
     try:
-        told = json.loads(read_bytes(path))
-        fits = all(isinstance(told[name], kind) for name, kind in _RESULTS.items())
-        if fits and all(isinstance(model["sha256"], str) for model in told["models"].values()):
-            return dict(told)
+        saved = json.loads(read_bytes(path))
+        fits = all(isinstance(saved[name], kind) for name, kind in _RESULTS.items())
+        if fits and all(isinstance(model["sha256"], str) for model in saved["models"].values()):
+            return dict(saved)
     except (json.JSONDecodeError, UnicodeDecodeError, LookupError, TypeError, AttributeError, RecursionError):
         pass
     raise ValueError(f"{path}: must be what train.evaluate writes, with {', '.join(_RESULTS)}; evaluate again")
 
 
 def _text(options: Card, state: TrainingState, rows: Rows, weights: Weights, results: Results) -> str:
-    """README.md: the author's words with what the files tell."""
+    """README.md: the author's words with what the files contain."""
     config, machine = from_dict(state.config), options.machine
     if machine is None and results:
         machine = f"{_machine(results[0][1]['machine'])} (of the evaluation)"
@@ -215,11 +215,11 @@ def _figures(options: Card, weights: Weights, results: Results) -> str:
     if not results:
         return "None yet."
     parts = []
-    for folder, told in results:
-        method = next(name for name, model in told["models"].items() if model["sha256"] == weights.sha256)
-        tables = result_tables(told, method, options.out.name, options.horizons)
+    for folder, saved in results:
+        method = next(name for name, model in saved["models"].items() if model["sha256"] == weights.sha256)
+        tables = result_tables(saved, method, options.out.name, options.horizons)
         sheets = [f"![{word} window]({_sheet_name(folder, word)})" for word in _words(folder)]
-        parts += [f"### {folder.resolve().name}: {told['title']}", *tables]
+        parts += [f"### {folder.resolve().name}: {saved['title']}", *tables]
         parts += ["Best, median and worst window:"] * bool(sheets) + sheets
     return "\n\n".join(parts)
 
@@ -230,32 +230,32 @@ def _commands(options: Card, config: Config, weights: Weights, results: Results)
     folder = PurePath(portable(str(options.out)))
     lines.append(f"python -m train.fit {(folder / 'config.yaml').as_posix()} out=runs/{options.out.name} "
                  f"data.train='{json.dumps(roots)}'")  # fmt: skip
-    lines += [_evaluate_command(told, weights) for _, told in results]
+    lines += [_evaluate_command(saved, weights) for _, saved in results]
     words = "Folders are to be put in (`config.yaml` has their last parts). The commands in turn:"
     return "\n".join([words, "", "```sh", *lines, "```"])
 
 
-def _evaluate_command(told: dict[str, Any], weights: Weights) -> str:
+def _evaluate_command(saved: dict[str, Any], weights: Weights) -> str:
     """With what results.json says was set, less what is as it would be anyway."""
-    name, (height, width) = told["settings"]["protocol"], told["settings"]["size"]
+    name, (height, width) = saved["settings"]["protocol"], saved["settings"]["size"]
     plain = PROTOCOLS[name]
-    usual = {field.name: field.default for field in dataclasses.fields(Evaluation)}
-    usual |= {"steps": plain.steps, "first": plain.first, "last": plain.last, "mode": weights.config.default_mode}
-    usual |= dict(zip(("height", "width"), plain.size, strict=True))
-    folders = {name: told["settings"].get(name) and name.upper() for name in ("data", "prepared")}
-    settings = told["settings"] | {"height": height, "width": width, **folders}
+    defaults = {field.name: field.default for field in dataclasses.fields(Evaluation)}
+    defaults |= {"steps": plain.steps, "first": plain.first, "last": plain.last, "mode": weights.config.default_mode}
+    defaults |= dict(zip(("height", "width"), plain.size, strict=True))
+    folders = {name: saved["settings"].get(name) and name.upper() for name in ("data", "prepared")}
+    settings = saved["settings"] | {"height": height, "width": width, **folders}
     words = ["python -m train.evaluate", name, f"--model {weights.name}"]
     for option, value in settings.items():
         given = tuple(value) if isinstance(value, list) else value
-        if option in usual and option != "protocol" and value is not None and given != usual[option]:
+        if option in defaults and option != "protocol" and value is not None and given != defaults[option]:
             words.append(f"--{option.replace('_', '-')}" + ("" if value is True else f" {value}" if given is value else
                                           " " + " ".join(map(str, given))))  # fmt: skip
     measured = {"squeeze": "--squeeze WEIGHTS", "st_lpips": "--st-lpips"}
-    return " ".join([*words, *(option for name, option in measured.items() if name in told["weights"])])
+    return " ".join([*words, *(option for name, option in measured.items() if name in saved["weights"])])
 
 
-def _machine(told: dict[str, str]) -> str:
-    return f"{told['cores']} cores, {told['processor']}, {told['device'].split(' ', 1)[-1]}"
+def _machine(saved: dict[str, str]) -> str:
+    return f"{saved['cores']} cores, {saved['processor']}, {saved['device'].split(' ', 1)[-1]}"
 
 
 def _horizons(config: Config) -> list[int]:

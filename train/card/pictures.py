@@ -1,4 +1,4 @@
-"""Pictures of a model card: the curves of a run, and contact sheets small enough for a repository."""
+"""Images of a model card: the curves of a run, and contact sheets small enough for a repository."""
 
 import io
 from collections.abc import Sequence
@@ -41,10 +41,10 @@ _QUALITIES: Final = (90, 80, 70)
 _SHRINK: Final = 0.85
 
 #: Space below and above the curves of a panel, a factor: even a curve of one value needs some.
-_ROOM: Final = 1.15
+_MARGIN: Final = 1.15
 
-#: The step time's axis ends above this share of rows: rare steps take many times as long, beside others' work.
-_USUAL: Final = 0.97
+#: The step time's axis ends above this share of rows: rare steps take many times as long, next to others' work.
+_TYPICAL: Final = 0.97
 
 _DOTS: Final = 100
 _INCHES: Final = (14.0, 8.0)
@@ -77,15 +77,15 @@ def draw_curves(path: Path, rows: Rows) -> None:
 
 
 def write_sheet(path: Path, source: Path, limit: int = SHEET_BYTES) -> None:
-    """A picture as a JPEG of at most ``limit`` bytes: first of lower quality, then smaller.
+    """An image as a JPEG of at most ``limit`` bytes: first of lower quality, then smaller.
 
     Args:
         path: of the JPEG.
-        source: the picture.
+        source: the image.
         limit: bytes, 10,000 or more.
 
     Raises:
-        ValueError: no such picture, or a ``limit`` that none would keep.
+        ValueError: no such image, or a ``limit`` that none would keep.
     """
     if limit < 10_000:
         raise ValueError(f"`limit` must be 10000 or more, got {limit}")
@@ -132,7 +132,7 @@ def stages_of(rows: Rows) -> list[tuple[str, int, int]]:
 
 
 def _curve(axis: Axes, rows: Rows, name: str, factor: float, labelled: bool) -> None:
-    """Each row faintly, the smoothed curve on it; one line a stage, for stages differ in what they show."""
+    """Each row faintly, the smoothed curve on it; one line per stage, for stages differ in what they show."""
     colour, label = None, name if labelled else None
     for stage, _, _ in stages_of(rows):
         own = [row for row in rows if row["stage"] == stage and row.get(name)]
@@ -145,7 +145,7 @@ def _curve(axis: Axes, rows: Rows, name: str, factor: float, labelled: bool) -> 
             axis.plot(steps, factor * values, color=colour, alpha=0.25, linewidth=0.7)
     low, high = axis.dataLim.intervaly
     if 0 < low <= high < np.inf:
-        axis.set_ylim(low / _ROOM, high * _ROOM)  # before the scale, which else looks for limits of its own
+        axis.set_ylim(low / _MARGIN, high * _MARGIN)  # before the scale, which else looks for limits of its own
         axis.set_yscale("log")
         axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.yaxis.set_minor_locator(NullLocator())
@@ -153,7 +153,7 @@ def _curve(axis: Axes, rows: Rows, name: str, factor: float, labelled: bool) -> 
 
 
 def _times(axis: Axes, rows: Rows) -> None:
-    """Seconds a step, one part on the other."""
+    """Seconds per step, one part on the other."""
     steps = np.array([row["step"] for row in rows])
     below = np.zeros(len(rows))
     sums = {part: np.array([row.get(f"s_{part}") or 0.0 for row in rows]) for part in PARTS}
@@ -162,8 +162,8 @@ def _times(axis: Axes, rows: Rows) -> None:
         share = seconds.sum() / total if total else 0
         axis.fill_between(steps, below, below + seconds, label=f"{part}, {share:.0%}", linewidth=0)
         below = below + seconds
-    top = _ROOM * float(np.quantile(below, _USUAL)) or 1.0
-    axis.set(title="seconds a step, and shares of all rows", ylabel="s", xlabel="step", ylim=(0, top))
+    top = _MARGIN * float(np.quantile(below, _TYPICAL)) or 1.0
+    axis.set(title="seconds per step, and shares of all rows", ylabel="s", xlabel="step", ylim=(0, top))
     axis.legend(loc="center left", fontsize=8)
 
 

@@ -24,7 +24,7 @@ from vestcl.prepare.prepared import PreparedClip
 #: A procedural street's name in a clip.
 _STREET: Final = re.compile(r"street (\d+)(?: .*)?")
 
-#: Speeds and turns are told from this to that percentile.
+#: Speeds and turns are listed from this to that percentile.
 _RANGE: Final = (5, 95)
 
 #: A pose that differs by less from the street's own at time 0 is that one, m.
@@ -49,7 +49,7 @@ class Weights:
 
 
 def about_model(weights: Weights) -> str:
-    """What the file holds: parameters a part, and the choices that its configuration makes."""
+    """What the file holds: parameters per part, and the choices that its configuration makes."""
     parts = {key.split(".")[0]: 0 for key in weights.state}
     for key, tensor in weights.state.items():
         parts[key.split(".")[0]] += tensor.numel()
@@ -133,11 +133,11 @@ def _seeds(clips: Sequence[PreparedClip]) -> str:
 
 
 def _ranges(numbers: Sequence[int]) -> list[str]:
-    told = []
+    results = []
     for _, run in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
         own = [value for _, value in run]
-        told.append(f"{own[0]}-{own[-1]}" if len(own) > 1 else f"{own[0]}")
-    return told
+        results.append(f"{own[0]}-{own[-1]}" if len(own) > 1 else f"{own[0]}")
+    return results
 
 
 def _driving(clips: Sequence[PreparedClip]) -> tuple[str, str]:
@@ -164,7 +164,7 @@ def _range(values: Sequence[float]) -> str:
 
 
 def prepare_commands(config: Config) -> list[str]:
-    """`vestcl prepare` of the streets that each folder holds, as far as they tell; "#" before what is no street.
+    """`vestcl prepare` of the streets that each folder holds, as far as they are known; "#" before what is no street.
 
     Raises:
         ValueError: data that is not there any more.
@@ -188,8 +188,8 @@ def _is_random(clip: PreparedClip) -> bool:
     found, pose = _STREET.fullmatch(clip.name), clip.world_from_cam(0)
     if found is None or pose is None or "=" in clip.name:
         return False
-    usual = Street.generate(int(found[1])).camera_pose(0.0)
-    return bool(np.abs(usual[:3, 3] - pose[:3, 3]).max() > _SAME_PLACE)
+    default = Street.generate(int(found[1])).camera_pose(0.0)
+    return bool(np.abs(default[:3, 3] - pose[:3, 3]).max() > _SAME_PLACE)
 
 
 # ---------------------------------------------------------------- training
@@ -227,7 +227,7 @@ def training_table(config: Config, rows: Rows, step: int, machine: str | None, v
 
 def _stage_seconds(rows: Rows) -> dict[str, tuple[str, str]]:
     """Minutes of each stage, and the share of splatting: a row's seconds hold for the steps since the row before."""
-    told, before = dict[str, tuple[str, str]](), 0
+    results, before = dict[str, tuple[str, str]](), 0
     for name, _, _ in stages_of(rows):
         sums = dict.fromkeys(PARTS, 0.0)
         for row in (row for row in rows if row["stage"] == name):
@@ -235,8 +235,8 @@ def _stage_seconds(rows: Rows) -> dict[str, tuple[str, str]]:
                 sums[part] += (row.get(f"s_{part}") or 0.0) * (row["step"] - before)
             before = row["step"]
         total = sum(sums.values())
-        told[name] = f"{total / 60:.1f}", f"{sums['splatting'] / total:.1%}" if total else "-"
-    return told
+        results[name] = f"{total / 60:.1f}", f"{sums['splatting'] / total:.1%}" if total else "-"
+    return results
 
 
 def _loss(loss: LossConfig) -> str:
@@ -260,25 +260,25 @@ def _optimiser(config: Config) -> str:
 # ---------------------------------------------------------------- results
 
 
-def result_tables(told: dict[str, Any], model: str, name: str, horizons: Sequence[int]) -> list[str]:
-    """A table a view: a row a metric and horizon, a column a method, and how the model differs from the baseline.
+def result_tables(results: dict[str, Any], model: str, name: str, horizons: Sequence[int]) -> list[str]:
+    """A table per view: a row per metric and horizon, a column a method, and how the model differs from the baseline.
 
     Args:
-        told: a results.json.
+        results: a results.json.
         model: the method that the card is of.
         name: what the card calls it.
         horizons: steps to show, of those that there are.
 
     Returns:
-        What was told of the evaluation, and the tables, in Markdown.
+        What was reported of the evaluation, and the tables, in Markdown.
     """
-    first = {window["view"]: int(window["first"]) for window in told["windows"]}
-    rivals = set(told["models"]) - {model}
-    made = [" ".join([f"{_scope(told)}.", *told.get("notes", ())])]
-    for view, methods in told["intervals"].items():
+    first = {window["view"]: int(window["first"]) for window in results["windows"]}
+    rivals = set(results["models"]) - {model}
+    made = [" ".join([f"{_scope(results)}.", *results.get("notes", ())])]
+    for view, methods in results["intervals"].items():
         shown = {method: found for method, found in methods.items() if plain(method) not in rivals}
         metrics = [metric for metric in METRICS if metric in next(iter(shown.values()))]
-        difference = told["differences"].get(view, {}).get(model, {})
+        difference = results["differences"].get(view, {}).get(model, {})
         rows = [
             (f"{METRICS[metric].label} {horizon(k)}", *_cells(shown, difference, metric, k - first[view]))
             for metric, k in itertools.product(metrics, (0, *horizons))
@@ -299,12 +299,12 @@ def _cells(methods: dict[str, Any], difference: dict[str, Any], metric: str, at:
     return [*cells, _difference(difference[metric][at], digits)] if difference else cells
 
 
-def _scope(told: dict[str, Any]) -> str:
-    settings, count = told["settings"], len({(w["clip"], w["index"]) for w in told["windows"]})
+def _scope(results: dict[str, Any]) -> str:
+    settings, count = results["settings"], len({(w["clip"], w["index"]) for w in results["windows"]})
     height, width = settings["size"]
-    clips = f"{len(told['clips'])} clip{'s' * (len(told['clips']) != 1)}"
+    clips = f"{len(results['clips'])} clip{'s' * (len(results['clips']) != 1)}"
     streets = f", seeds {settings['seeds'][0]} to {settings['seeds'][1]}" if settings["protocol"] == "street" else ""
-    machine, date = told["machine"]["processor"], told["machine"]["date"][:10]
+    machine, date = results["machine"]["processor"], results["machine"]["date"][:10]
     return f"{count} windows of {clips}{streets}, {height} x {width} px; means with 95 % intervals; {date}, {machine}"
 
 

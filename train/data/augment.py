@@ -1,4 +1,4 @@
-"""Augmentation that keeps geometry true: what is done to the pictures is done to cameras and motions, too.
+"""Augmentation that keeps geometry true: what is done to the images is done to cameras and motions, too.
 
 A window is cut out, resized, mirrored and coloured as a whole, in NumPy, before the networks' input is made of it: the
 prior follows from the mirrored motions by itself.
@@ -48,7 +48,7 @@ class TrainingWindow:
     target_K: Matrix  # noqa: N815 (the matrix K)
     """[3, 3] px."""
     tgt_from_next: Matrix
-    """[4, 4] m: the target's camera beside the source camera at t + k; the identity if it is the source camera."""
+    """[4, 4] m: the target's camera relative to the source camera at t + k; identity if it is the same."""
     future_from_cur: Matrix | None
     """[4, 4] m: the camera's true motion from t to t + k; None where it is not known."""
     path_from_cur: tuple[Matrix, ...] = ()
@@ -74,7 +74,7 @@ def crop(window: TrainingWindow, top: int, left: int, height: int, width: int) -
         width: columns that stay.
 
     Returns:
-        The part; its pictures are views of the whole's.
+        The part; its images are views of the whole's.
 
     Raises:
         ValueError: a part that is not inside.
@@ -92,7 +92,7 @@ def crop(window: TrainingWindow, top: int, left: int, height: int, width: int) -
 
 
 def resize(window: TrainingWindow, height: int, width: int) -> TrainingWindow:
-    """Everything at another size: K' = diag(s_x, s_y, 1) K; pictures by mean over area, all else the nearest pixel.
+    """Everything at another size: K' = diag(s_x, s_y, 1) K; images by mean over area, all else the nearest pixel.
 
     Args:
         window: at its own size.
@@ -121,7 +121,7 @@ def resize(window: TrainingWindow, height: int, width: int) -> TrainingWindow:
 def flip(window: TrainingWindow) -> TrainingWindow:
     """The world in a mirror, x -> -x.
 
-    With S = diag(-1, 1, 1): pictures mirrored left to right, K' = [[-1, 0, W], [0, 1, 0], [0, 0, 1]] K S, so that
+    With S = diag(-1, 1, 1): images mirrored left to right, K' = [[-1, 0, W], [0, 1, 0], [0, 0, 1]] K S, so that
     c_x' = W - c_x; velocities S v; motions S R S and S t, which makes (w, x, -y, -z) of a quaternion, and a left
     camera of a right one.
 
@@ -158,7 +158,7 @@ class Colour:
     """b."""
 
     def __call__(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """[3, H, W] RGB in [0, 1] -> the same, in memory of its own.
+        """[3, H, W] RGB in [0, 1] -> the same, in its own memory.
 
         The sums are written out: a matrix product's last bits depend on how many threads share it.
         """
@@ -180,7 +180,7 @@ def draw_colour(rng: np.random.Generator, strength: float, grey: float) -> Colou
         grey: level that contrast leaves where it is.
 
     Returns:
-        The change, for all pictures of a window.
+        The change, for all images of a window.
 
     Raises:
         ValueError: a strength outside [0, 1].
@@ -196,12 +196,12 @@ def draw_colour(rng: np.random.Generator, strength: float, grey: float) -> Colou
 
 
 def colour(window: TrainingWindow, change: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> TrainingWindow:
-    """``change`` applied to every picture of a window: the frames', the backgrounds' and the target."""
+    """``change`` applied to every image of a window: the frames', the backgrounds' and the target."""
     return _mapped(window, change, _same, _same)
 
 
 def mean_luma(image: NDArray[np.float32]) -> float:
-    """The mean of a picture's luma, [3, H, W] -> a level in [0, 1]."""
+    """The mean of an image's luma, [3, H, W] -> a level in [0, 1]."""
     return float(LUMA @ image.mean(axis=(1, 2), dtype=np.float64))
 
 
@@ -218,7 +218,7 @@ def _mapped(
     planes: Callable[[Any], Any],
     intrinsics: Callable[[Matrix], Matrix],
 ) -> TrainingWindow:
-    """The window with its pictures, its other planes (depths, masks, velocities) and its K changed."""
+    """The window with its images, its other planes (depths, masks, velocities) and its K changed."""
 
     def frame(frame: PerceivedFrame) -> PerceivedFrame:
         changed = {

@@ -108,7 +108,7 @@ def degrade(window: TrainingWindow, done: Degradation, rng: np.random.Generator)
         rng: for the noise.
 
     Returns:
-        The window, in memory of its own.
+        The window, in its own memory.
     """
     even = 1.0, 1.0, 1.0
     return replace(

@@ -44,7 +44,7 @@ class Batch(NamedTuple):
     target: torch.Tensor
     """[B, 3, H, W] RGB in [0, 1]."""
     tgt_from_next: torch.Tensor
-    """[B, 4, 4] m: the target's camera beside the source camera at t + k; the identity if it is the source camera."""
+    """[B, 4, 4] m: the target's camera relative to the source camera at t + k; identity if it is the same."""
     target_K: torch.Tensor  # noqa: N815 (the matrix K)
     """[B, 3, 3] px."""
     future_from_cur: torch.Tensor
@@ -88,7 +88,7 @@ class WindowSet:
     crop: tuple[int, int] | None = None
     """(height, width) px of what is cut out; None takes whole frames."""
     scale: tuple[float, float] = (1.0, 1.0)
-    """Smallest and largest factor that pictures are shrunk by first, uniform between; without ``crop`` one factor."""
+    """Smallest and largest factor that images are shrunk by first, uniform between; without ``crop`` one factor."""
     flip: bool = False
     """Mirror half of the windows."""
     colour: float = 0.0
@@ -173,7 +173,7 @@ class WindowSet:
         """The places of a step's batch, over all ranks.
 
         Position p = step batch + i of an endless sequence has the window that epoch p // n's permutation has at
-        p mod n, with n windows: every window once an epoch. With weights p's group is drawn first, and n counts its
+        p mod n, with n windows: every window once per epoch. With weights p's group is drawn first, and n counts its
         windows: in an epoch each comes up or not, by the group's weight. k is drawn for the step, the camera and the
         augmentation for p.
 
@@ -359,7 +359,7 @@ def loader(
     Args:
         windows: to draw from.
         seed: of the run.
-        batch: windows a step, over all ranks.
+        batch: windows per step, over all ranks.
         steps: range(next step, end), which is all that a resumed run has to know.
         rank: this process.
         world: number of processes; a divisor of ``batch``.

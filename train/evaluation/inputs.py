@@ -189,7 +189,7 @@ def sentences(by_clip: Mapping[str, Mapping[str, Inputs]]) -> tuple[str, ...]:
         groups.setdefault(_sentences(by_label), []).append(clip)
     if len(groups) < 2:
         return next(iter(groups), ())
-    return tuple(f"{_listed(clips)}: {' '.join(told)}" for told, clips in groups.items())
+    return tuple(f"{_listed(clips)}: {' '.join(notes)}" for notes, clips in groups.items())
 
 
 def _sentences(by_label: Mapping[str, Inputs]) -> tuple[str, ...]:

@@ -58,7 +58,7 @@ class Evaluation:
     --mask-model. Without it: estimated where one of these is given, else splatted."""
     learned: Learned = "tested"
     """Models that start from what was measured correct the geometric forecast by the learned parts that win a test on
-    the frames before (tested), as `vestcl forecast` does, or forecast by themselves with all parts (all)."""
+    the frames before (tested), as `vestcl forecast` does, or forecast on their own with all parts (all)."""
     depth_model: str | None = None
     """Estimate depth by this checkpoint (a folder, or a name on huggingface.co)."""
     mask_model: str | None = None
@@ -76,11 +76,11 @@ class Evaluation:
     drive: Literal["usual", "road"] = "usual"
     """How cameras drive down streets: as the street has it, or with bends, braking, stops and a body on springs."""
     street_fps: float | None = None
-    """Frames a second of streets; without it 10."""
+    """Frames per second of streets; without it 10."""
     samples: int = 2
-    """Rays a pixel and direction, of streets."""
+    """Rays per pixel and direction, of streets."""
     shard: str | None = None
-    """I/N, 0 <= I < N: do this share of the windows. Without it RANK and WORLD_SIZE tell, as torchrun sets them."""
+    """I/N, 0 <= I < N: do this share of the windows. Without it RANK and WORLD_SIZE count, as torchrun sets them."""
     merge: bool = False
     """Forecast nothing: make the tables of what is done, which must be everything."""
     sheets: bool = True

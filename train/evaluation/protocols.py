@@ -75,7 +75,7 @@ class Where:
     frames: int
     """Of a street."""
     samples: int
-    """Rays a pixel and direction, of streets."""
+    """Rays per pixel and direction, of streets."""
     prepared: Path | None = None
     """Folder of prepared clips, in place of ``data``."""
     accumulated_depth: bool = False
@@ -87,7 +87,7 @@ class Where:
         """``data``.
 
         Raises:
-            ValueError: none is told.
+            ValueError: none is given.
         """
         if self.data is None:
             raise ValueError("`data` must be a folder: the data set's root or, for `clip`, the sequence; got none")
@@ -131,7 +131,7 @@ class Protocol:
     last: int | None = None
     """The last one; None: as long as the future lasts."""
     now: bool = False
-    """Whether the right camera's picture at t is asked for, too."""
+    """Whether the right camera's image at t is asked for, too."""
     paper: tuple[Published, ...] = ()
 
 

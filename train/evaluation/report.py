@@ -27,13 +27,13 @@ from vestcl.evaluation.tables import (
 )
 from vestcl.scene.inputs import Inputs
 
-#: What models are held against: the forecast without weights and, for the camera's motion, where that takes it from.
+#: What models are compared with: the forecast without weights and, for the camera's motion, where that takes it from.
 _BASELINES: Final = (GEOMETRIC, CONSTANT_VELOCITY)
 
 #: What ends the title of the paper's table.
 _PAPER: Final = ", the paper"
 
-#: Clips of a table a clip; more go to results.json alone.
+#: Clips of a table per clip; more go to results.json alone.
 CLIP_ROWS: Final = 60
 
 #: The first of each that there is stands for likeness and for distance where a table has room for no more.
@@ -51,7 +51,7 @@ class EvaluationResults:
     """That tables show."""
     models: tuple[str, ...]
     """As methods are called, without labels."""
-    told: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     """What was given to methods and what was not measured, a sentence each."""
     leaks: tuple[str, ...] = ()
     """Which models were trained on what is evaluated, a sentence each: notes of every table."""
@@ -65,7 +65,7 @@ class EvaluationResults:
     @property
     def notes(self) -> tuple[str, ...]:
         """All sentences: on inputs, on what was not measured, on what models were trained on."""
-        return (*sentences(self.inputs), *self.told, *self.leaks)
+        return (*sentences(self.inputs), *self.remarks, *self.leaks)
 
     def is_model(self, method: str) -> bool:
         """Whether a row is a model's, with whatever label."""
@@ -147,12 +147,12 @@ def _difference_grids(results: EvaluationResults) -> list[Grid]:
 
 
 def _baseline(method: str, methods: Collection[str]) -> str | None:
-    """The row with the same label that a model is held against, if there is one."""
+    """The row with the same label that a model is compared with, if there is one."""
     return next((name for name in (base + label_of(method) for base in _BASELINES) if name in methods), None)
 
 
 def _clip_grids(results: EvaluationResults) -> list[Grid]:
-    """A row a clip."""
+    """A row per clip."""
     made = []
     for view, of_view in by_view(results.records).items():
         clips = list(dict.fromkeys(record.clip for record in of_view))
@@ -207,7 +207,7 @@ def markdown(results: EvaluationResults, about: Sequence[str]) -> str:
 
 
 def table_of_windows(records: Sequence[Record]) -> str:
-    """results.csv: a row a window, view, method and horizon; empty where a view has no such metric."""
+    """results.csv: a row per window, view, method and horizon; empty where a view has no such metric."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["clip", "frame", "t", "view", "method", "horizon", "seconds", *METRICS])
@@ -229,7 +229,7 @@ def as_json(results: EvaluationResults, about: Mapping[str, Any]) -> dict[str, A
     groups, by_clip = by_method(results.records), dict[str, Any]()
     for clip in dict.fromkeys(record.clip for record in results.records):
         by_clip[clip] = summarise([record for record in results.records if record.clip == clip])
-    told: dict[str, Any] = {
+    remarks: dict[str, Any] = {
         **about,
         "title": results.protocol.title,
         "notes": list(results.notes),
@@ -244,7 +244,7 @@ def as_json(results: EvaluationResults, about: Mapping[str, Any]) -> dict[str, A
         "paper": [asdict(row) for row in results.protocol.paper],
         "windows": [asdict(record) for record in results.records],
     }
-    checked: dict[str, Any] = finite(told)
+    checked: dict[str, Any] = finite(remarks)
     return checked
 
 

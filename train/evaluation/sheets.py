@@ -57,7 +57,8 @@ def write_sheets(
 
 
 def window_sheet(source: Source, setup: Setup, record: Record, shown: Sequence[int], title: str) -> Picture:
-    """A row a horizon: the truth, the geometric forecast, the record's method, and both errors |a - b| (mean over RGB).
+    """A row per horizon: the truth, the geometric forecast, the record's method, and both errors |a - b| (mean over
+    RGB).
 
     Args:
         source: of the record's clip.

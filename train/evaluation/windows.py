@@ -1,4 +1,5 @@
-"""Forecast windows and score them: in parts that are kept on disk, so that a killed run goes on and several share one.
+"""Forecast windows and score them: in parts that are kept on disk, so that a killed run continues and several share
+one.
 
 A part is a run of consecutive windows of one clip. Its file is named by clip, first window and a key of all that its
 numbers depend on; it is there whole or not at all.
@@ -111,7 +112,7 @@ def run_part(part: ShardPart, setup: Setup, advance: Callable[[], None] = lambda
 
     Args:
         part: of `plan`.
-        setup: as the part's key tells.
+        setup: as in the part's key.
         advance: called after each window.
 
     Raises:
@@ -155,7 +156,7 @@ def _read(part: ShardPart, take: Callable[[Any], Made]) -> Made | None:
     try:
         return take(json.loads(read_bytes(part.file)))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{part.file}: holds no scores ({error}); delete it to have them made anew") from error
+        raise ValueError(f"{part.file}: holds no scores ({error}); delete it to have them made again") from error
 
 
 def prepared(clip: Clip, setup: Setup) -> Clip:

@@ -7,8 +7,8 @@
         manifest.json                   format, and size and SHA-256 of each file
 
 A checkpoint is written under a hidden name, flushed to the disk and then renamed, so that a folder ``step-*`` is
-complete unless the disk itself lost something; sizes and hashes tell. The latest one is found by listing: there is no
-pointer that could be wrong. One process writes to a run's folder, any number may read.
+complete unless the disk itself lost something; sizes and hashes show it. The latest one is found by listing: there is
+no pointer that could be wrong. One process writes to a run's folder, any number may read.
 """
 
 import io

@@ -80,7 +80,7 @@ def total_loss(
 
     Returns:
         The sum, differentiable in the view's image and in the step's motion, and each term before its weight,
-        detached. Terms of weight 0 are left out, but those of the motion, which cost nothing, are always told.
+        detached. Terms of weight 0 are left out, but those of the motion, which cost nothing, are always given.
 
     Raises:
         ValueError: shapes don't fit, or ``perceptual`` is missing.
@@ -175,7 +175,7 @@ def residual_motion(step: Step, batch: Batch) -> torch.Tensor:
     """mean |U - U0| / max(D, NEAREST) over the pixels of both frames, foreground and background.
 
     U is the motion that is used and U0 what object motion starts from, metres: the rigid flow, and what a model that
-    starts from measurements was told of moving things. D is the pixel's depth, so that the term is about the shift on
+    starts from measurements was given moving objects. D is the pixel's depth, so that the term is about the shift on
     the image in focal lengths. Its gradient where both agree, as at the start of training, is 0.
 
     Args:

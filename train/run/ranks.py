@@ -16,7 +16,7 @@ from torch.distributed.rendezvous import rendezvous
 
 from vestcl import opencl
 
-#: A process that does not answer for so long is given up, and torchrun starts all of them anew.
+#: A process that does not answer for so long is given up, and torchrun starts all of them again.
 PATIENCE: Final = timedelta(minutes=10)
 
 #: The largest TCP port.
@@ -74,17 +74,17 @@ class Ranks:
         """Whether it is true in any process; all get the same answer."""
         if self.world == 1:
             return flag
-        told = torch.tensor(int(flag))
-        distributed.all_reduce(told, distributed.ReduceOp.MAX)
-        return bool(told)
+        total = torch.tensor(int(flag))
+        distributed.all_reduce(total, distributed.ReduceOp.MAX)
+        return bool(total)
 
     def mean(self, values: dict[str, float]) -> dict[str, float]:
         """Of each value over the processes, which all have the same names."""
         if self.world == 1:
             return values
-        told = torch.tensor(list(values.values()), dtype=torch.float64) / self.world
-        distributed.all_reduce(told)
-        return dict(zip(values, told.tolist(), strict=True))
+        total = torch.tensor(list(values.values()), dtype=torch.float64) / self.world
+        distributed.all_reduce(total)
+        return dict(zip(values, total.tolist(), strict=True))
 
     def device(self) -> str | None:
         """The OpenCL device of this process: the machine's devices of the default's kind in turn, one each.
@@ -93,8 +93,8 @@ class Ranks:
             Its index in `vestcl devices`; None is the default, where there is but one of its kind.
         """
         default = opencl.select()
-        alike = [each.index for each in opencl.devices() if each.kind == default.kind != "CPU"]
-        return alike[self.local % len(alike)] if alike else None
+        same = [each.index for each in opencl.devices() if each.kind == default.kind != "CPU"]
+        return same[self.local % len(same)] if same else None
 
     def leave(self) -> None:
         """Say goodbye to the others.

@@ -1,4 +1,4 @@
-"""What a run tells while it goes on: a bar on the terminal, log.jsonl, TensorBoard's scalars and images."""
+"""What a running training logs: a bar on the terminal, log.jsonl, TensorBoard's scalars and images."""
 
 import json
 from collections import deque
@@ -23,7 +23,7 @@ from vestcl.models.forecaster import RenderedView
 
 LOG: Final = "log.jsonl"
 
-#: Losses on the bar are means over so many updates.
+#: Losses on the bar are means over this many updates.
 _SMOOTHED: Final = 50
 
 #: Bytes of a damaged line that its error shows.
@@ -44,7 +44,7 @@ class Reporter:
         recent: of the reporter that a resumed run's checkpoint is from; its updates count in the next row's means.
 
     Raises:
-        ValueError: the run's log.jsonl has a line that is no row.
+        ValueError: the run's log.jsonl has a line that is not a row.
     """
 
     def __init__(
@@ -76,10 +76,10 @@ class Reporter:
         if not self._speaks:
             return
         seconds = {"data": waited, **update.seconds}
-        told = {**update.terms, **{f"s_{name}": value for name, value in seconds.items()}}
-        if self._recent and self._recent[-1].keys() != told.keys():  # a stage with other terms
+        logged = {**update.terms, **{f"s_{name}": value for name, value in seconds.items()}}
+        if self._recent and self._recent[-1].keys() != logged.keys():  # a stage with other terms
             self._recent.clear()
-        self._recent.append(told)
+        self._recent.append(logged)
         self._bar.update(self._task, completed=step, description=self._described(stage))
         run = self._config.run
         with self._even_on_a_full_disk():
@@ -88,7 +88,7 @@ class Reporter:
             if run.image_every and step % run.image_every == 0 and update.view is not None:
                 self._show(step, update.view, batch)
         if update.skipped:
-            self.say(f"step {step}: no number, skipped ({', '.join(batch.clips)})", "yellow")
+            self.say(f"step {step}: non-finite, skipped ({', '.join(batch.clips)})", "yellow")
 
     @property
     def recent(self) -> list[dict[str, float]]:
@@ -110,7 +110,7 @@ class Reporter:
 
     @contextmanager
     def _even_on_a_full_disk(self) -> Iterator[None]:
-        """What can't be written is told of once: no run is lost for its curves."""
+        """What can't be written is reported once: no run is lost for its curves."""
         try:
             yield
         except OSError as error:
@@ -165,7 +165,7 @@ def read_log(path: Path) -> list[dict[str, Any]]:
     """The rows of a log.jsonl; a last line that a killed process left half written is left out.
 
     Raises:
-        ValueError: a line is no row; the message has the file and the line's number.
+        ValueError: a line is not a row; the message has the file and the line's number.
         OSError: the file can't be read.
     """
     lines = path.read_bytes().split(b"\n")[:-1]

@@ -15,7 +15,7 @@ _OF_STAGE: Final = re.compile(r"stages\.(\d+)\.(.*)")
 
 
 def check_resume(state: TrainingState, config: Config) -> None:
-    """Whether ``config`` goes on with what ``state`` began. Other versions of packages are warned of.
+    """Whether ``config`` continues with what ``state`` began. Other versions of packages are warned of.
 
     ``run``, ``out`` and the number of workers may change. So may the steps of stages that are not over and of the last
     one, and stages may be added at the end.

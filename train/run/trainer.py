@@ -35,7 +35,7 @@ class Update:
     view: RenderedView | None
     """Without the graph of its computation. None in stages that render nothing."""
     skipped: bool
-    """Whether the weights stayed as they were, because something was no number."""
+    """Whether the weights stayed as they were, because something was not finite."""
 
 
 def build_model(config: Config) -> Forecaster:
@@ -152,16 +152,16 @@ class Trainer:
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self._learning, self.config.optimiser.clip_norm or math.inf)
         broken = self.ranks.any(not (math.isfinite(loss.item()) and math.isfinite(norm.item())))
-        told = {"loss": loss.item(), **{name: term.item() for name, term in terms.items()}, "gradient": norm.item()}
+        logged = {"loss": loss.item(), **{name: term.item() for name, term in terms.items()}, "gradient": norm.item()}
         if broken and self.config.run.on_nan == "stop":
-            raise NotANumberError(", ".join(f"{name} {value:g}" for name, value in told.items()))
+            raise NotANumberError(", ".join(f"{name} {value:g}" for name, value in logged.items()))
         if not broken:
             self.adam.step()
         self.schedule.step()
         session_seconds = session.seconds - splatting
         seconds = {"networks": time.perf_counter() - start - session_seconds, "splatting": session_seconds}
         shown = None if view is None else RenderedView(*(image.detach() for image in view))
-        return Update(self.ranks.mean(told), seconds, shown, broken)
+        return Update(self.ranks.mean(logged), seconds, shown, broken)
 
     def state(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Of Adam and of the learning rate's schedule."""

@@ -1,4 +1,4 @@
-"""Everything that a training run is told: frozen, checked when it is built. `load_config` reads files and overrides.
+"""All settings of a training run: frozen, checked when it is built. `load_config` reads files and overrides.
 
 A configuration is built from plain values: strings for paths, lists for tuples. Whatever is out of range, of another
 kind or unknown raises pydantic's ValidationError, a ValueError; `load_config` and `from_dict` put it into words.
@@ -64,7 +64,7 @@ class DataConfig:
     crop: tuple[Count, Count] | None = None
     """(height, width) px of a window drawn at random; null shows whole images."""
     scale: tuple[Scale, Scale] = (1.0, 1.0)
-    """(smallest, largest) factor that pictures are shrunk by before they are cropped."""
+    """(smallest, largest) factor that images are shrunk by before they are cropped."""
     flip: bool = True
     """Mirror every other sample."""
     colour: Share = 0.2
@@ -199,7 +199,7 @@ class RunConfig:
     precision: Literal["float32", "bfloat16"] = "float32"
     """Of encoder and refinement; motion, splatting and losses are float32."""
     on_nan: Literal["stop", "skip"] = "stop"
-    """What follows a loss or a gradient that is no number."""
+    """What follows a non-finite loss or gradient."""
     threads: Count | None = None
     """Of torch, in each process; null leaves it to torch."""
 

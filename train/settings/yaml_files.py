@@ -143,7 +143,7 @@ def _line(problem: Any, kind: type) -> str:
     key, value = ".".join(map(str, problem["loc"])), problem.get("input")
     if problem["type"] == "unexpected_keyword_argument":
         nearest = _nearest(key, [known for known, _ in _keys(kind)])
-        return f"`{key}` is no key" + (f"; did you mean `{nearest}`?" if nearest else "")
+        return f"`{key}` is not a key" + (f"; did you mean `{nearest}`?" if nearest else "")
     if problem["type"] == "missing" or (value is None and key):
         return f"`{key}` must be set: add {key}=..."
     if problem["type"] == "value_error":

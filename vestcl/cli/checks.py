@@ -35,7 +35,7 @@ def check_input(text: str) -> None:
 
 
 def one_street(text: str) -> street_input.StreetInput | None:
-    """The procedural street that an input names, which is no file; None for any other text, or several streets.
+    """The procedural street that an input names, which is not a file; None for any other text, or several streets.
 
     Raises:
         ValueError: an option that a street does not have.
@@ -65,7 +65,7 @@ def check_folders(options: ClipOptions) -> None:
     for name in ("depth", "labels"):
         folder: Path | None = getattr(options, name)
         if folder is not None and not folder.is_dir():
-            what = "is no folder" if folder.exists() else "does not exist"
+            what = "is not a folder" if folder.exists() else "does not exist"
             raise ValueError(f"`{name}` must be a folder of files with the frames' names, and {folder} {what}")
 
 
@@ -129,7 +129,7 @@ def check_forecast(options: Forecast) -> None:
         if min(options.score_size) < 1:
             raise ValueError(f"`score_size` must be 1 px or more, got {options.score_size}")
     if options.mode is not None and options.model is None:
-        raise ValueError("`mode` is how a network goes on after its first step; it needs `model`")
+        raise ValueError("`mode` is how a network continues after its first step; it needs `model`")
     if options.perceive is not None and options.model is None:
         raise ValueError("`perceive` is how a network sees its own forecast; it needs `model`")
     if options.learned is not None and options.model is None:

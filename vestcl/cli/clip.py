@@ -58,7 +58,7 @@ def open_clip(
             raise ValueError(f"{text}: is a street, which takes height, width, not {', '.join(wrong)}")
         if street.driven.depth or street.driven.masks:
             raise ValueError(f"{text}: must have no depth and masks here; `vestcl prepare` takes them")
-        height, width = (given or usual for given, usual in zip(size, STREET_SIZE, strict=True))
+        height, width = (given or default for given, default in zip(size, STREET_SIZE, strict=True))
         clip = street_input.clip(street.seeds[0], street.driven, street_frames, (height, width))
         return with_estimates(clip, estimators)
     checks.check_folders(options)
@@ -70,7 +70,7 @@ def load_estimators(depth_model: str | None, mask_model: str | None) -> Estimato
     """The estimators that options name: an existing file is an ONNX network, anything else a checkpoint.
 
     Raises:
-        ValueError: an estimator whose package, file or checkpoint is missing, or a file that is no network.
+        ValueError: an estimator whose package, file or checkpoint is missing, or a file that is not a network.
     """
     if depth_model is None and mask_model is None:
         return Estimators(None, None)

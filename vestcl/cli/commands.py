@@ -22,7 +22,7 @@ class Devices:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Try every OpenCL device, each in a process of its own, and tell the remedy for what does not work."""
+    """Try every OpenCL device, each in a separate process, and print the remedy for what does not work."""
 
     timeout: float = 120.0
     """Seconds that a device may take."""
@@ -35,7 +35,7 @@ class Demo:
     """Render a procedural street, forecast it and show it from another camera."""
 
     out: Path = Path("out")
-    """Folder for the pictures."""
+    """Folder for the images."""
     height: int = 256
     """Pixels."""
     width: int = 832
@@ -93,7 +93,7 @@ class ClipOptions:
 class Forecast(ClipOptions):
     """Forecast the next frames of a driving clip, and show them from other cameras.
 
-    The folder OUT gets pictures, OpenEXR and a video of each view, and forecast.json.
+    The folder OUT gets images, OpenEXR and a video of each view, and forecast.json.
     """
 
     input: tyro.conf.Positional[str]
@@ -112,7 +112,7 @@ class Forecast(ClipOptions):
     """With mode feedback: depth and mask of forecast frames are splatted, or estimated by --depth-model and
     --mask-model. Without it: estimated where one of these is given, else splatted."""
     quality: Literal["exact", "balanced", "fast"] | None = None
-    """With --model: balanced (usual) is within 0.1 dB of exact in PSNR, fast not; docs/time_against_error has both."""
+    """With --model: balanced (default) is within 0.1 dB of exact in PSNR, fast is not; see docs/time_against_error."""
     learned: Literal["tested", "all"] | None = None
     """With --model, if it starts from what was measured: correct the geometric forecast by the learned parts that would
     have improved it at the last frame (tested), or forecast by the network with all of them, untested. Without it:
@@ -125,7 +125,7 @@ class Forecast(ClipOptions):
     """The current frame t, counted from 0; it and the ones before it are seen. Without it: the last one, or with
     --compare the last that has STEPS true frames after it."""
     compare: bool = False
-    """Score forecast and baselines (with --model geometry, too) against the frames that the clip goes on with."""
+    """Score forecast and baselines (with --model geometry, too) against the frames that follow in the clip."""
     squeeze: Path | None = None
     """With --compare: SqueezeNet 1.0 weights for a distance in its features."""
     st_lpips: StLpipsOption = None
@@ -194,7 +194,7 @@ class Prepare(ClipOptions):
     frames: int = 12
     """Frames of each street."""
     samples: int = 2
-    """Streets' colour is the mean over samples x samples rays a pixel."""
+    """Streets' colour is the mean over samples x samples rays per pixel."""
     drive: Literal["usual", "random", "road"] = "usual"
     """How cameras drive down streets: as the street has it; the same, but drawn at random in the ranges of real cars,
     from a random time on; or with bends, braking, stops and a body on springs. This and the next three are for streets
@@ -206,9 +206,9 @@ class Prepare(ClipOptions):
     """Where streets' masks come from: true labels, motion, or labels with a classifier's errors; random draws one of
     the latter two for each street."""
     street_fps: str | None = None
-    """Frames a second of streets, or random: 8 to 30. Without it 10."""
+    """Frames per second of streets, or random: 8 to 30. Without it 10."""
     shard: str | None = None
-    """I/N, I from 0: every N-th clip from the I-th on. Without it what torchrun tells, if it started this."""
+    """I/N, I from 0: every N-th clip from the I-th on. Default: torchrun's RANK and WORLD_SIZE, if set."""
     workers: int = 1
     """Processes."""
 

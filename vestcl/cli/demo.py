@@ -1,7 +1,7 @@
 """`vestcl demo`: the whole job on a procedural street, whose future can be seen from any camera.
 
 What a car with two cameras would have is all that the forecast gets: the stereo pairs up to now, their calibration, and
-classes of the pixels, as a segmentation network tells them. A network's forecast is held against the geometric one,
+classes of the pixels, as a segmentation network predicts them. A network's forecast is compared with the geometric one,
 which is made of the same depth and motion.
 """
 
@@ -37,16 +37,16 @@ from vestcl.models import shipped
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import quality
 
-#: Frames up to the current one, all that the forecast looks at, and the rate, frames a second.
+#: Frames up to the current one, all that the forecast looks at, and the rate, frames per second.
 CONTEXT, FPS = 4, 10.0
 
 #: Seconds into the drive: an oncoming car is near.
 START: Final = 0.7
 
-#: Rays a pixel and direction: pictures as a camera's, without jagged edges.
+#: Rays per pixel and direction: images as a camera's, without jagged edges.
 SAMPLES: Final = 2
 
-#: The source camera, the rig's right one, and one that no car has: beside it, higher up, turned to the left.
+#: The source camera, the rig's right one, and one that no car has: next to it, higher up, turned to the left.
 VIEWS: Final = ("source", "right", "0.6,-0.3,0,yaw=-4,name=beside")
 
 #: Steps that the sheet shows.
@@ -70,9 +70,9 @@ def run(
     """Forecast one street from three cameras, compare with what then happens there, and write it all.
 
     Args:
-        out: folder for forecast.json, a folder of pictures, video and OpenEXR a view, and sheet.png; made if missing.
-        height: rows of the pictures.
-        width: columns of the pictures.
+        out: folder for forecast.json, a folder of images, video and OpenEXR per view, and sheet.png; made if missing.
+        height: rows of the images.
+        width: columns of the images.
         seed: of the street.
         model: NETWORK or any other that `Forecaster.from_pretrained` knows, or GEOMETRIC; None is
             NETWORK where this installation has it, else GEOMETRIC.
@@ -135,7 +135,7 @@ def true_image(street: Street, clip: Clip, index: int, view: View) -> Image:
 def _forecasts(
     perception: Perception, index: int, steps: int, views: Sequence[View], forecaster: Forecaster | None
 ) -> dict[str, Forecast]:
-    """The forecast, and beside a network's the geometric one, both from what is perceived once."""
+    """The forecast, and next to a network's the geometric one, both from what is perceived once."""
     by_geometry = functools.partial(geometric.forecast_frames, perception, index, steps, views)
     if forecaster is None:
         return {FORECAST: by_geometry()}
@@ -165,7 +165,7 @@ def _score(image: Image, truth: Image) -> dict[str, float]:
 
 
 def _sheet(perception: Perception, index: int, forecast: Forecast, truth: dict[str, list[Image]]) -> sheet.Picture:
-    """What was seen and understood; then, for two of the views, forecast, truth and error at some steps."""
+    """The preprocessed frame; then, for two of the views, forecast, truth and error at some steps."""
     layers = perception.seen(index).layers
     before, now = (sheet.rgb(perception.image(at)) for at in (index - 1, index))
     depth = sheet.depth_map(layers.depth)
@@ -204,7 +204,7 @@ def _score_table(scores: dict[str, dict[str, list[dict[str, float]]]], forecast:
 
 
 def _time_table(forecasts: dict[str, Forecast]) -> Table:
-    """The forecast's stages, and what the geometric one beside a network's took in addition."""
+    """The forecast's stages, and what the geometric one took in addition to a network's."""
     table, stages = Table("stage", "ms", box=box.SIMPLE), dict(forecasts[FORECAST].seconds)
     if GEOMETRIC in forecasts:
         stages |= {"geometric, to compare": forecasts[GEOMETRIC].seconds["render"]}

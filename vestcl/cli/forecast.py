@@ -62,13 +62,13 @@ class _Stages:
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[Callable[[float], None]]:
-        """Times the block; yields what it may tell its share done to."""
+        """Times the block; yields the function that takes the share done."""
         self.show(name, 0.0)
         with self.clock.time(name):
             yield lambda share: self.show(name, share)
 
     def show(self, name: str, share: float) -> None:
-        """Draw the bar anew."""
+        """Draw the bar again."""
         self.bar.update(self.task, description=name, completed=share)
 
 
@@ -111,9 +111,9 @@ def run(options: commands.Forecast) -> None:
                     comparisons = [_beside(*pair, rival.method) for pair in zip(comparisons, rivals, strict=True)]
         with stages.stage(forecast_files.WRITING) as report:
             details = _details(options, clip, index, forecast, comparisons, later)
-            told = dataclasses.replace(forecast, seconds=dict(stages.clock.seconds))
+            timed = dataclasses.replace(forecast, seconds=dict(stages.clock.seconds))
             write = functools.partial(forecast_files.write_forecast, exr=options.exr, gif=options.gif, report=report)
-            write(options.out, told, clip, index, views, details)
+            write(options.out, timed, clip, index, views, details)
             truths = {each.view: each.truth for each in comparisons}
             page.write_page(options.out, forecast, clip, index, views, truths=truths, scores=details.scores)
     for comparison in comparisons:
@@ -223,7 +223,7 @@ def _details(
     comparisons: list[Comparison],
     later: LaterFrames | None,
 ) -> forecast_files.Details:
-    """What forecast.json tells, and a sheet a view: beside the truth where it is known."""
+    """What forecast.json contains, and a sheet per view: next to the truth where it is known."""
     what = f"{clip.name}, {forecast.method} forecast from frame {clip[index].name}, view "
     compared = {each.view: each for each in comparisons}
     sheets = {
@@ -242,7 +242,7 @@ def _details(
 
 
 def _score_table(comparison: Comparison, later: LaterFrames | None) -> Table:
-    """A block of rows a metric, a row a method, a column a step: the first, the last and some between."""
+    """A block of rows per metric, a row per method, a column per step: the first, the last and some between."""
     count = len(comparison.truth)
     shown = sorted({round(1 + (count - 1) * part / (STEPS_SHOWN - 1)) for part in range(STEPS_SHOWN)})
     note = "; oracle: the right camera's own past" if comparison.stereo else ""
@@ -267,8 +267,8 @@ def _score_table(comparison: Comparison, later: LaterFrames | None) -> Table:
 def _print_end(console: Console, saved: forecast_files.SavedForecast) -> None:
     file = saved.about["settings"].get("model_file")
     mode = saved.about["settings"].get("mode")
-    told = [saved.about["method"], *([file] if file else []), *([f"mode {mode}"] if mode else [])]
-    console.print(Text(f"forecast: {', '.join(told)}"), soft_wrap=True)
+    timed = [saved.about["method"], *([file] if file else []), *([f"mode {mode}"] if mode else [])]
+    console.print(Text(f"forecast: {', '.join(timed)}"), soft_wrap=True)
     seconds: dict[str, float] = saved.about["seconds"]
     table = Table("stage", box=box.SIMPLE)
     table.add_column("seconds", justify="right")
@@ -294,7 +294,7 @@ def _print_end(console: Console, saved: forecast_files.SavedForecast) -> None:
 
 
 def _paths(view: dict[str, Any]) -> Iterator[Path]:
-    """The pictures as first ... last, then the files that there is one of."""
+    """The images as first ... last, then the files that there is one of."""
     for kind in ("image", "exr"):
         files = [Path(frame[kind]) for frame in view["frames"] if kind in frame]
         if files:

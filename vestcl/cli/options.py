@@ -179,7 +179,7 @@ def check_output(shown: str, path: Path, is_file: bool) -> None:
     except OSError as error:
         raise ValueError(f"{shown} {str(path)[:80]}: {error.strerror}") from error
     if not there.is_dir():
-        raise ValueError(f"{shown} {path}: can't be made, since {there} is no folder")
+        raise ValueError(f"{shown} {path}: can't be made, since {there} is not a folder")
     if not os.access(there, os.W_OK | os.X_OK):
         raise ValueError(f"{shown} {path}: can't be made, since {there} can't be written")
 

@@ -21,12 +21,12 @@ from vestcl.cli.progress import ProgressBar
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
 from vestcl.prepare.clip import Outcome, Report, prepare_clip
-from vestcl.prepare.workers import Task, Told, run_tasks
+from vestcl.prepare.workers import Summary, Task, run_tasks
 from vestcl.scene.inpainting.inpainters import LAMA, inpainter
 from vestcl.scene.inputs import inputs_of
 
-#: Where a data set's cache is without ``out``: in it, or for a file beside it.
-BESIDE: Final = ".vestcl"
+#: Where a data set's cache is without ``out``: in it, or for a file next to it.
+CACHE_SUFFIX: Final = ".vestcl"
 
 #: How a network's depth is used, in a cache's key: combined with motion's.
 COMBINED: Final = "combined"
@@ -46,7 +46,7 @@ def run(options: Prepare) -> None:
     A clip that can't be prepared stops none of the others.
 
     Raises:
-        ValueError: an option out of range, an input that is no clip, a file that is missing or malformed.
+        ValueError: an option out of range, an input that is not a clip, a file that is missing or malformed.
         OSError: a frame can't be written, or a process was killed. What is there stays.
     """
     _check(options)
@@ -56,7 +56,7 @@ def run(options: Prepare) -> None:
     hidden = not console.is_terminal or os.environ.get("LOCAL_RANK", "0") != "0"  # one bar a terminal
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     bar = ProgressBar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden)
-    told, done, total = Told(), 0, sum(task.frames for task in tasks)
+    summary, done, total = Summary(), 0, sum(task.frames for task in tasks)
     with interrupt.summary(lambda: _stopped(done, total)), bar:
         shown = bar.add_task("frames", total=total)
 
@@ -65,11 +65,11 @@ def run(options: Prepare) -> None:
             done += 1
             bar.advance(shown)
 
-        run_tasks(tasks, functools.partial(_prepare, options=options), told, advance, options.workers)
-    if told.computed + told.kept:
-        _print_end(console, told, tasks, f", shard {part}/{parts}" if parts > 1 else "")
-    if told.failures:
-        raise ValueError("\n".join(told.failures))
+        run_tasks(tasks, functools.partial(_prepare, options=options), summary, advance, options.workers)
+    if summary.computed + summary.kept:
+        _print_end(console, summary, tasks, f", shard {part}/{parts}" if parts > 1 else "")
+    if summary.failures:
+        raise ValueError("\n".join(summary.failures))
 
 
 def _stopped(done: int, total: int) -> str:
@@ -79,17 +79,17 @@ def _stopped(done: int, total: int) -> str:
     return f"stopped; {done} of {total} frames are prepared, and the same command prepares the others"
 
 
-def shard(told: str | None, environment: Mapping[str, str]) -> tuple[int, int]:
+def shard(given: str | None, environment: Mapping[str, str]) -> tuple[int, int]:
     """Which part of the clips is this process's: (I, N), the clips I, I + N, I + 2 N ...
 
     Args:
-        told: "I/N", 0 <= I < N, or None.
-        environment: where torchrun tells RANK and WORLD_SIZE; without them and ``told`` it is all.
+        given: "I/N", 0 <= I < N, or None.
+        environment: where torchrun sets RANK and WORLD_SIZE; without them and ``given`` it is all.
 
     Raises:
         ValueError: no such part.
     """
-    name, text = "`shard`", told
+    name, text = "`shard`", given
     if text is None:
         if "RANK" not in environment or "WORLD_SIZE" not in environment:
             return 0, 1
@@ -109,7 +109,7 @@ def plan(options: Prepare, part: int = 0, parts: int = 1) -> list[Task]:
         parts: how many processes share the inputs.
 
     Raises:
-        ValueError: an input that is no clip, a street without ``out``, or two clips for one folder.
+        ValueError: an input that is not a clip, a street without ``out``, or two clips for one folder.
     """
     texts = [text for given in options.inputs for text in _expanded(given)]
     tasks: dict[Path, Task] = {}
@@ -168,9 +168,9 @@ def _cache(text: str, options: Prepare) -> Path:
     if options.out is not None:
         return options.out
     if street_input.parse(text) is not None:
-        raise ValueError(f"{text}: is no folder to keep a cache in; `--out` must name one")
+        raise ValueError(f"{text}: is not a folder to keep a cache in; `--out` must name one")
     path = Path(text)
-    return (path if path.is_dir() else path.parent) / BESIDE
+    return (path if path.is_dir() else path.parent) / CACHE_SUFFIX
 
 
 def estimators(options: Prepare) -> str:
@@ -217,16 +217,18 @@ def _prepare(task: Task, waits: bool, report: Report, options: Prepare) -> Outco
     )
 
 
-def _print_end(console: Console, told: Told, tasks: Sequence[Task], which: str) -> None:
+def _print_end(console: Console, summary: Summary, tasks: Sequence[Task], which: str) -> None:
     table = Table("stage", box=box.SIMPLE)
     table.add_column("seconds", justify="right")
-    for stage, taken in (told.seconds | {"all": sum(told.seconds.values())}).items():
+    for stage, taken in (summary.seconds | {"all": sum(summary.seconds.values())}).items():
         table.add_row(stage, f"{taken:.2f}")
     console.print(table)
-    about = f"{len(tasks)} clip{'s' * (len(tasks) != 1)}{which}: {told.computed} frames computed, {told.kept} kept"
+    about = (
+        f"{len(tasks)} clip{'s' * (len(tasks) != 1)}{which}: {summary.computed} frames computed, {summary.kept} kept"
+    )
     console.print(about, highlight=False)
-    if told.computed:
-        each, frames = sum(told.seconds.values()) / told.computed, sum(task.frames for task in tasks) / len(tasks)
+    if summary.computed:
+        each, frames = sum(summary.seconds.values()) / summary.computed, sum(task.frames for task in tasks) / len(tasks)
         console.print(f"{each:.2f} s per computed frame, {each * frames:.1f} s per clip of {frames:g}", highlight=False)
     for folder in dict.fromkeys(str(task.folder.parent) for task in tasks):
         console.print(folder, highlight=False, markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Where frames come from: the procedural street, and one reader a data set, which `open.open_sequence` chooses."""
+"""Where frames come from: the procedural street, and one reader per data set, which `open.open_sequence` chooses."""
 
 from vestcl.data.street.clip import street_clip
 from vestcl.data.street.raycast import STREET_SKY_DEPTH, Frame, Label

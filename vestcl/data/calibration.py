@@ -109,7 +109,7 @@ def _mean_turn(turn: Matrix) -> Matrix:
 
 
 def check_intrinsics(K: Matrix, where: str) -> None:
-    """Refuse what is no camera.
+    """Refuse what is not a camera.
 
     Raises:
         ValueError: not [3, 3], not finite, a focal length not positive, or another last row than (0, 0, 1).
@@ -121,7 +121,7 @@ def check_intrinsics(K: Matrix, where: str) -> None:
 
 
 def check_rigid(dst_from_src: Matrix, where: str) -> None:
-    """Refuse what is no rigid motion.
+    """Refuse what is not a rigid motion.
 
     Raises:
         ValueError: not [4, 4], not finite, another last row than (0, 0, 0, 1), R no rotation, or a shift of more

@@ -125,7 +125,7 @@ def _mismatch(K: Matrix, calibrated: Size, size: Size, where: str, place: str) -
     cut = f"cx = {K[0, 2] - 0.5:.6g} - columns cut off at the left, cy = {K[1, 2] - 0.5:.6g} - rows cut off at the top"
     resized = camera_json(scaled(K, calibrated, size), size)
     return (
-        f"{where}: is for pictures of {calibrated} (height, width), but they are {size}: {sx:.4f} of the width and "
+        f"{where}: is for images of {calibrated} (height, width), but they are {size}: {sx:.4f} of the width and "
         f"{sy:.4f} of the height. {place} {resized} if they were resized; if they were cropped, "
         f"with fx = {K[0, 0]:.6g}, fy = {K[1, 1]:.6g}, {cut}"
     )

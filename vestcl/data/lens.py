@@ -23,7 +23,7 @@ from vestcl.data import calibration, fit
 from vestcl.data.sources import DepthSource, ImageFile, ImageSource, LabelSource
 from vestcl.io.labels import VOID
 
-#: Radii at which a distortion is held against growing with the radius.
+#: Radii at which a distortion is compared with growing with the radius.
 _RADII: Final = 2048
 
 #: The largest share of pixels that a recorded image may not show.
@@ -76,7 +76,9 @@ class Lens:
             ValueError: the distortion leaves less than half of the image, or the image is too large.
         """
         if max(size) > _LONGEST:
-            raise ValueError(f"{where}: images with distortion must have at most {_LONGEST} px a side, got {max(size)}")
+            raise ValueError(
+                f"{where}: images with distortion must have at most {_LONGEST} px per side, got {max(size)}"
+            )
         lens = cls(_numbers(K), *size, distortion)
         share = float(lens.at(64, 64).outside().mean())
         if share > _MOST_OUTSIDE:

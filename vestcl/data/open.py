@@ -1,4 +1,4 @@
-"""One door to every reader: the layout on disk tells which one it is."""
+"""One door to every reader: the layout on disk selects it."""
 
 import inspect
 from collections.abc import Callable
@@ -65,7 +65,7 @@ _LAYOUTS: Final = (
     _Layout(
         "Virtual KITTI 2", "frames/rgb (or VARIANT/frames/rgb)", _is_virtual_kitti, virtual_kitti.open_virtual_kitti
     ),
-    _Layout("folder", "camera.json, or pictures (then give `fov`)", _is_folder, folder.open_folder),
+    _Layout("folder", "camera.json, or images (then give `fov`)", _is_folder, folder.open_folder),
 )
 
 
@@ -117,7 +117,7 @@ def _recognise(path: Path) -> _Layout:
     if drives:
         raise ValueError(f"{path}: has KITTI raw drives; open one of {', '.join(drives)}")
     wanted = "; ".join(f"{layout.name}: {layout.looks_like}" for layout in _LAYOUTS)
-    raise ValueError(f"{path}: is no clip that vestcl knows. It looked for {wanted}")
+    raise ValueError(f"{path}: unrecognised dataset layout. It looked for {wanted}")
 
 
 def _with_depth(clip: Clip, where: Path, depth_scale: float | None) -> Clip:

@@ -1,4 +1,4 @@
-"""Resizing of pictures, depth and labels in continuous pixel coordinates: K' = diag(sx, sy, 1) K, no halves.
+"""Resizing of images, depth and labels in continuous pixel coordinates: K' = diag(sx, sy, 1) K, no halves.
 
 The target pixel in row i covers the source rows [i H / h, (i + 1) H / h); columns likewise.
 """

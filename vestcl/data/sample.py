@@ -1,4 +1,4 @@
-"""What every reader gives: a clip of samples, one a frame, all typed and measured alike.
+"""What every reader gives: a clip of samples, one per frame, all typed and measured alike.
 
 A sample holds no pixels: it knows where they are and reads them when asked, at the sample's own size. So a drive of
 thousands of frames opens at once, and `Sample.resized` costs nothing but a K.
@@ -64,11 +64,11 @@ class RightCamera(_CameraImage):
 
     image: ImageSource
     K: NDArray[np.float64]
-    """[3, 3] px, of a picture of ``size``."""
+    """[3, 3] px, of an image of ``size``."""
     right_from_left: NDArray[np.float64]
     """[4, 4] m; t_x is minus the baseline."""
     size: tuple[int, int] | None = None
-    """(height, width) to read at; None is the picture's own."""
+    """(height, width) to read at; None is the image's own."""
 
     def __post_init__(self) -> None:
         calibration.check_intrinsics(self.K, "right camera")
@@ -106,9 +106,9 @@ class Sample(_CameraImage):
     """Of the frame in its clip, "0000000012"."""
     image: ImageSource
     K: NDArray[np.float64]
-    """[3, 3] px, continuous coordinates (pixel centres at +0.5), of a picture of ``size``."""
+    """[3, 3] px, continuous coordinates (pixel centres at +0.5), of an image of ``size``."""
     size: tuple[int, int] | None = None
-    """(height, width) to read at; None is the picture's own."""
+    """(height, width) to read at; None is the image's own."""
     timestamp: float | None = None
     """Seconds, from an arbitrary start."""
     world_from_cam: NDArray[np.float64] | None = None
@@ -117,7 +117,7 @@ class Sample(_CameraImage):
     labels: LabelSource | None = None
     """Where the background mask M comes from."""
     ego_vehicle: RegionSource | None = None
-    """The recording car's own bonnet, where it is in the picture and known."""
+    """The recording car's own bonnet, where it is in the image and known."""
     right: RightCamera | None = None
 
     def __post_init__(self) -> None:
@@ -192,7 +192,7 @@ class Sample(_CameraImage):
         return background(self.read_labels())
 
     def read_ego_vehicle(self) -> NDArray[np.bool_]:
-        """[1, height, width], True where the recording car itself is in the picture; nowhere if that is not known.
+        """[1, height, width], True where the recording car itself is in the image; nowhere if that is not known.
 
         Raises:
             ValueError: the file is missing, damaged or of other proportions.
@@ -224,7 +224,7 @@ class Sample(_CameraImage):
         if not (rounded or fit.same_proportions((height, width), (self.image.height, self.image.width))):
             where = getattr(source, "path", f"sample {self.name}: {name}")
             wanted = f"{self.image.height} x {self.image.width}"
-            raise ValueError(f"{where}: must have the proportions of the picture, {wanted}, got {height} x {width}")
+            raise ValueError(f"{where}: must have the proportions of the image, {wanted}, got {height} x {width}")
         return resized(planes, self.height, self.width)
 
 

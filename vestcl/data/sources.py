@@ -1,4 +1,4 @@
-"""Where a sample's pictures come from: files that are read when they are asked for, or arrays at hand."""
+"""Where a sample's images come from: files that are read when they are asked for, or arrays at hand."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from vestcl.io.video.reading import Video
 
 
 class ImageSource(Protocol):
-    """A picture of known size."""
+    """An image of known size."""
 
     @property
     def height(self) -> int:
@@ -29,21 +29,21 @@ class ImageSource(Protocol):
 
 
 class DepthSource(Protocol):
-    """A depth map over the picture's whole field of view, of any size."""
+    """A depth map over the image's whole field of view, of any size."""
 
     def read(self) -> NDArray[np.float32]:
         """[1, H, W] m, valid iff > 0."""
 
 
 class LabelSource(Protocol):
-    """Classes over the picture's whole field of view, of any size."""
+    """Classes over the image's whole field of view, of any size."""
 
     def read(self) -> NDArray[np.uint8]:
         """[1, H, W] Cityscapes train ids, 255 = void."""
 
 
 class RegionSource(Protocol):
-    """A part of the picture's field of view, of any size."""
+    """A part of the image's field of view, of any size."""
 
     def read(self) -> NDArray[np.bool_]:
         """[1, H, W]."""
@@ -94,7 +94,7 @@ class VideoFrame:
 
 @dataclass(frozen=True, eq=False)
 class ImageArray:
-    """A picture at hand."""
+    """An image at hand."""
 
     image: NDArray[np.float32]
     """[3, H, W] RGB in [0, 1]."""
@@ -110,7 +110,7 @@ class ImageArray:
         return self.image.shape[2]
 
     def read(self) -> NDArray[np.float32]:
-        """A copy of the picture."""
+        """A copy of the image."""
         return self.image.copy()
 
 

@@ -1,4 +1,4 @@
-"""A forecast beside what then happened, and beside forecasts that need neither depth nor weights."""
+"""A forecast compared with what then happened, and with forecasts that need neither depth nor weights."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -43,7 +43,7 @@ FORECAST: Final = "forecast"
 #: dB of PSNR from which on one forecast counts as better than another: what tables show.
 LEAST_PSNR: Final = 0.01
 
-#: Metric -> how tables call it, with the digits that tell methods apart.
+#: Metric -> how tables call it, with the digits that distinguish methods.
 METRICS: Final = {
     "psnr": ("PSNR, dB", ".2f"),
     "ssim": ("SSIM", ".4f"),
@@ -132,7 +132,7 @@ def compare(
 
 
 def comparison_sheet(comparison: Comparison, title: str = "") -> Picture:
-    """A row a step: the forecast, the truth, the forecast's error |a - b| (mean over RGB), and the baselines.
+    """A row per step: the forecast, the truth, the forecast's error |a - b| (mean over RGB), and the baselines.
 
     Args:
         comparison: of one view.

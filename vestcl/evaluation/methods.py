@@ -41,7 +41,7 @@ def forecasts_of(
         views: cameras.
         models: networks, by the name of their row.
         flow: the network of `vestcl.forecasting.peer`; None leaves that row out.
-        future_from_cur: [4, 4] m a step, the true motion of the camera; None leaves that row out.
+        future_from_cur: [4, 4] m per step, the true motion of the camera; None leaves that row out.
 
     Returns:
         By the names of rows, in that order.

@@ -1,7 +1,7 @@
 """How good a forecast is: images against the truth, ego-motion and 3D motion against the truth.
 
-Every function answers with one number an image or sample, [B]; the mean over a data set is the caller's. Where a
-number is undefined (nothing visible, a car that stands still) it is NaN, so take means with `torch.nanmean`.
+Every function answers with one number per image or sample, [B]; the mean over a data set is the caller's. Where a
+number is undefined (nothing visible, a car that is static) it is NaN, so take means with `torch.nanmean`.
 """
 
 from typing import Final, NamedTuple

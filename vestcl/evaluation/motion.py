@@ -1,4 +1,4 @@
-"""The camera's forecast motion beside the true one."""
+"""The camera's forecast motion compared with the true one."""
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ def true_motion(clip: Clip, index: int, steps: int) -> list[NDArray[np.float64]]
         steps: k's end; t + steps is a frame.
 
     Returns:
-        [4, 4] m a step, or None where a pose is unknown.
+        [4, 4] m per step, or None where a pose is unknown.
     """
     poses = [sample.world_from_cam for sample in clip[index : index + steps + 1]]
     known = [pose for pose in poses if pose is not None]
@@ -36,7 +36,7 @@ def ego_errors(forecast: Forecast, truth: list[NDArray[np.float64]]) -> dict[str
         truth: see `true_motion`.
 
     Returns:
-        "rotation_deg" and "translation_percent"; the latter NaN where the car stood.
+        "rotation_deg" and "translation_percent"; the latter NaN where the car was static.
     """
     estimate, wanted = (torch.from_numpy(np.stack(motions)) for motions in (forecast.future_from_cur, truth))
     errors = metrics.ego_motion_error(estimate, wanted)

@@ -68,7 +68,7 @@ class Lpips(_LearntDistance):
 
     Args:
         trunk: "alexnet" or "vgg16", with LPIPS_SCALING.
-        heads: one weight a channel, for each map: [C_l].
+        heads: one weight per channel, for each map: [C_l].
 
     Raises:
         ValueError: another trunk or normalisation, or heads of other sizes.
@@ -110,7 +110,7 @@ class StLpips(_LearntDistance):
 
     Args:
         trunk: of the five maps.
-        heads: one weight a channel, for each map: [C_l].
+        heads: one weight per channel, for each map: [C_l].
 
     Raises:
         ValueError: heads of other sizes.

@@ -35,7 +35,7 @@ def error_shares(truth: Truth, forecast: Forecast, index: int, view: View) -> di
         view: one of the forecast's.
 
     Returns:
-        "error_in_holes", ... and "area_of_holes", ..., a number a step; NaN where the image has no error at all.
+        "error_in_holes", ... and "area_of_holes", ..., a number per step; NaN where the image has no error at all.
     """
     shares: dict[str, list[float]] = {f"{what}_{name}": [] for what in ("error_in", "area_of") for name in REGIONS}
     before = np.eye(4)
@@ -81,7 +81,7 @@ def regions_of(
 def own_speed(
     frame: Rendered, K: NDArray[np.float64], tgt_from_next: NDArray[np.float64], next_from_cur: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """|motion_xyz - (x - A^-1 x)| [H, W] m an interval: the motion beyond that of the camera, A = ``next_from_cur``.
+    """|motion_xyz - (x - A^-1 x)| [H, W] m per interval: the motion beyond that of the camera, A = ``next_from_cur``.
 
     x is the pixel's point in the source camera's axes at the frame's time, as ``motion_xyz`` has it.
     """

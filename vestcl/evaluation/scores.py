@@ -1,4 +1,4 @@
-"""Pictures beside the truth: what every method shows of a window's next frames, and how good it is."""
+"""Images next to the truth: what every method shows of a window's next frames, and how good it is."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -44,7 +44,7 @@ Pictures = Sequence[NDArray[np.float32]]
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """One method's pictures of one view."""
+    """One method's images of one view."""
 
     pictures: Pictures
     seconds: float
@@ -69,7 +69,7 @@ Forecasts = Mapping[str, Timed]
 
 @dataclass(frozen=True)
 class Record:
-    """How good one method's pictures of one view of one window are."""
+    """How good one method's images of one view of one window are."""
 
     clip: str
     frame: str
@@ -79,13 +79,13 @@ class Record:
     method: str
     seconds: float
     scores: dict[str, list[float]]
-    """By metric, a number a step."""
+    """By metric, a number per step."""
     first: int = 1
     """The first of these steps: 0 is the current frame itself."""
 
 
 class Look(NamedTuple):
-    """A picture as it is scored."""
+    """An image as it is scored."""
 
     picture: torch.Tensor
     """[1, 3, h, w], 8 bit."""
@@ -106,7 +106,7 @@ class Truth:
         trunk: SqueezeNet 1.0, or None.
         lpips: or None.
         st_lpips: or None.
-        border: share of each side's outer pixels that are scored as black, in the truth and in what is held against
+        border: share of each side's outer pixels that are scored as black, in the truth and in what is compared with
             it (`vestcl.evaluation.border.blacken_border`); SSIM's windows then reach beyond the image, as in VEST-MPI.
     """
 
@@ -134,7 +134,7 @@ class Truth:
         if key not in self._full:
             camera = seen_by(view, self.clip[index])
             if camera is None:
-                raise ValueError(f"{self.clip.name}: frame {self.clip[index].name} has no picture from {view.name}")
+                raise ValueError(f"{self.clip.name}: frame {self.clip[index].name} has no image from {view.name}")
             self._full[key] = camera.read_image().copy()
         return self._full[key]
 
@@ -164,10 +164,10 @@ def look(
     st_lpips: StLpips | None = None,
     border: float = 0.0,
 ) -> list[Look]:
-    """Resize, quantise, and take the trunks' maps of all pictures in one go.
+    """Resize, quantise, and take the trunks' maps of all images in one go.
 
     Args:
-        pictures: [3, H, W] each.
+        images: [3, H, W] each.
         size: (height, width) px.
         trunk: SqueezeNet 1.0, or None.
         lpips: or None.
@@ -175,13 +175,13 @@ def look(
         border: as `Truth` has it.
 
     Raises:
-        ValueError: pictures too small for a trunk.
+        ValueError: images too small for a trunk.
     """
     resized = np.stack([resize_image(picture, *size) for picture in pictures])
     batch = metrics.quantise(torch.from_numpy(resized))
     if border:
         batch = blacken_border(batch, border)
-    trunks = (trunk, *(None if learnt is None else learnt.trunk for learnt in (lpips, st_lpips)))
+    trunks = (trunk, *(None if trained is None else trained.trunk for trained in (lpips, st_lpips)))
     with torch.no_grad():
         # Convolutions are as fast in either layout, pooling and norms over channels twice as fast in this one.
         maps = [[] if one is None else one(batch.contiguous(memory_format=torch.channels_last)) for one in trunks]
@@ -191,7 +191,7 @@ def look(
 def predictions(truth: Truth, index: int, steps: int, views: Sequence[View], forecasts: Forecasts) -> Predictions:
     """What the baselines and ``forecasts`` show of one window.
 
-    The baselines see the source camera alone, as the forecasts do, and are held against every view. Of another view
+    The baselines see the source camera alone, as the forecasts do, and are compared with every view. Of another view
     optical flow is shown once more with that camera's own past, which no forecast from the source camera has.
 
     Args:
@@ -232,14 +232,14 @@ def score(
     later: Sequence[int] | None = None,
     report: Callable[[float], None] | None = None,
 ) -> list[Record]:
-    """Every prediction of one window beside the truth, step by step.
+    """Every prediction of one window compared with the truth, step by step.
 
     Args:
         truth: of the clip.
         index: the current frame t.
         views: as in ``predictions``.
-        predictions: by view and method, a picture a step.
-        forecast: its coverage tells which pixels the source camera has seen ("psnr_seen").
+        predictions: by view and method, an image per step.
+        forecast: its coverage shows which pixels the source camera has seen ("psnr_seen").
         first: the step that ``forecast`` begins with, 0 for the current frame itself.
         later: the true frame of each step; None takes one after the other from ``index + first`` on.
         report: is given the share of the steps that are done, 0 to 1.
@@ -270,7 +270,7 @@ def score(
 
 
 def _looks(pictures: Iterable[NDArray[np.float32]], known: Mapping[int, Look], truth: Truth) -> dict[int, Look]:
-    """By the pictures' ids. Some occur twice, in several views or, the last frame, in every step; they are looked at
+    """By the images' ids. Some occur twice, in several views or, the last frame, in every step; they are looked at
     once."""
     wanted = {id(picture): picture for picture in pictures}
     new = {key: picture for key, picture in wanted.items() if key not in known}
@@ -279,7 +279,7 @@ def _looks(pictures: Iterable[NDArray[np.float32]], known: Mapping[int, Look], t
 
 
 def _scores(looks: Sequence[Look], wanted: Look, seen: torch.Tensor, truth: Truth) -> dict[str, torch.Tensor]:
-    """Of M pictures, all metrics that the size allows, [M] each."""
+    """Of M images, all metrics that the size allows, [M] each."""
     pictures = torch.cat([each.picture for each in looks])
     target = wanted.picture.expand_as(pictures)
     side = min(pictures.shape[2:])

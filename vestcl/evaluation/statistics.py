@@ -1,6 +1,6 @@
 """What windows' scores say together: intervals by resampling clips, differences between methods, the extreme windows.
 
-Neighbouring windows of a clip show the same things, so clips are what is drawn again, with all of their windows:
+Neighbouring windows of a clip show the same objects, so clips are what is drawn again, with all of their windows:
 
     x* = sum_c n_c S_c / sum_c n_c N_c
 
@@ -82,7 +82,7 @@ def intervals(records: Sequence[Record]) -> dict[str, list[Interval]]:
 
 
 def interval_grid(title: str, records: Sequence[Record], horizons: Sequence[int], metrics: Sequence[str]) -> Grid:
-    """A table of `intervals`: a row a method, for each metric a column a horizon.
+    """A table of `intervals`: a row per method, for each metric a column a horizon.
 
     Args:
         title: of the table.

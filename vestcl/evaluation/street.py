@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 
 def shot(sample: Sample) -> Shot | None:
-    """How the street took this sample, or None: it is no street's."""
+    """How the street took this sample, or None: it is not a street's."""
     return sample.image.shot if isinstance(sample.image, StreetImage) else None
 
 

@@ -16,7 +16,7 @@ from vestcl.evaluation import metrics
 from vestcl.evaluation.scores import RIGHT, Record
 
 Means = dict[str, list[float]]
-"""By metric, a number a step."""
+"""By metric, a number per step."""
 
 
 class Metric(NamedTuple):
@@ -24,7 +24,7 @@ class Metric(NamedTuple):
 
     label: str
     digits: str
-    """As many as tell methods apart."""
+    """As many as distinguish methods."""
     better: int
     """+1 where more is better, -1 where less is."""
     note: str = ""
@@ -92,7 +92,7 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
 
 
 def picture_grids(name: str, records: Sequence[Record], horizons: Sequence[int], running: bool = False) -> list[Grid]:
-    """A table a view: a row a method, for each metric a column a horizon.
+    """A table per view: a row per method, for each metric a column a horizon.
 
     Args:
         name: what the windows are of.
@@ -178,7 +178,7 @@ def number(value: float, digits: str) -> str:
 
 
 def _notes(view: str, shown: Sequence[str]) -> tuple[str, ...]:
-    notes = ["s: seconds a window, on this machine.", *(METRICS[m].note for m in shown if METRICS[m].note)]
+    notes = ["s: seconds per window, on this machine.", *(METRICS[m].note for m in shown if METRICS[m].note)]
     if view == RIGHT:
         notes.append("Forecasts see the source camera alone; an oracle sees what the right camera saw before.")
     return tuple(notes)

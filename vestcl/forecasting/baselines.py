@@ -1,4 +1,4 @@
-"""Forecasts with neither depth nor weights, to run beside the real one: repeat the last frame, extrapolate flow.
+"""Forecasts with neither depth nor weights, to compare with the real one: repeat the last frame, extrapolate flow.
 
 Both take the two last frames and answer with [B, steps, 3, H, W]: the frames at t+1 to t+steps.
 """

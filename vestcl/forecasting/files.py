@@ -1,13 +1,13 @@
-"""A forecast on disk: pictures, videos and OpenEXR of every view, and forecast.json, which tells about all of them.
+"""A forecast on disk: images, videos and OpenEXR of every view, and forecast.json, which describes all of them.
 
     DIR/forecast.json          written last, whole or not at all: where it is, the forecast is complete
     DIR/VIEW/000001.png        the frame at t+1, 8 bit
     DIR/VIEW/000001.exr        its colour, depth, coverage and 3D motion (vestcl/io/exr.py)
     DIR/VIEW/forecast.mp4      the source view: the frames up to t, then the forecast; others: the forecast
-    DIR/VIEW/forecast.gif      the same, if wanted
-    DIR/VIEW/sheet.png         an overview, if there is one: beside the truth where that is known
+    DIR/VIEW/forecast.gif      the same, if asked for
+    DIR/VIEW/sheet.png         an overview, if there is one: next to the truth where that is known
 
-Files are replaced one by one; what lies in DIR and is not written anew stays.
+Files are replaced one by one; what lies in DIR and is not written again stays.
 """
 
 import json
@@ -45,10 +45,10 @@ JSON: Final = "forecast.json"
 #: The stage that forecast.json adds to the forecast's own.
 WRITING: Final = "write the files"
 
-#: Frames a second of a video whose clip does not tell: KITTI's.
+#: Frames per second of a video whose clip does not have any: KITTI's.
 FPS: Final = 10.0
 
-#: Frames up to t that the source view's videos show first: as many as the usual evaluation gives (SPEC section 10).
+#: Frames up to t that the source view's videos show first: as many as the default evaluation gives (SPEC section 10).
 CONTEXT: Final = 4
 
 #: A list of numbers as JSON spreads it over lines.
@@ -59,7 +59,7 @@ Report = Callable[[float], None]
 
 @dataclass(frozen=True, eq=False)
 class Details:
-    """What forecast.json tells beside the forecast itself."""
+    """What forecast.json contains in addition to the forecast itself."""
 
     input: str
     """Where the clip is from."""
@@ -73,7 +73,7 @@ class Details:
 
 @dataclass(frozen=True, eq=False)
 class SavedForecast:
-    """A forecast on disk; pictures are read when they are asked for."""
+    """A forecast on disk; images are read when they are asked for."""
 
     folder: Path
     about: dict[str, Any]
@@ -132,17 +132,17 @@ def write_forecast(
         clip: what it is a forecast of.
         index: of the frame t in ``clip``.
         views: the cameras; their names become folders.
-        details: what else forecast.json tells.
+        details: what else forecast.json contains.
         exr: write OpenEXR, too.
         gif: write a GIF, too.
-        report: told the share of the views that are written, 0 to 1.
+        report: called with the share of the views that are written, 0 to 1.
 
     Returns:
         The path of forecast.json.
 
     Raises:
-        ValueError: no frame, one without one of the views, an index outside the clip, or a view's name that is no
-            folder's.
+        ValueError: no frame, one without one of the views, an index outside the clip, or a view's name that is not
+            a folder's.
         OSError: a file can't be written, the disk is full for one; the message names it.
     """
     _check(forecast, clip, index, views)

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera beside the forecast one."""
+    """A camera relative to the forecast one."""
 
     name: str
     tgt_from_next: NDArray[np.float64]
-    """[4, 4] m: from the source camera as it stands at the forecast time."""
+    """[4, 4] m: from the source camera as it is at the forecast time."""
     K: NDArray[np.float64] | None = None
     """[3, 3] px; None is the source camera's."""
 

@@ -7,7 +7,7 @@ from vestcl.io.contact_sheet import DEPTH_COLOURS, FAR, NEAR, Cell, Picture, dep
 
 
 def forecast_sheet(frames: Sequence[Rendered], title: str = "") -> Picture:
-    """A row a step: colour, depth and coverage.
+    """A row per step: colour, depth and coverage.
 
     Args:
         frames: of one view, at t+1, ...
@@ -23,7 +23,7 @@ def forecast_sheet(frames: Sequence[Rendered], title: str = "") -> Picture:
         [
             Cell(rgb(frame.image), f"t+{step}  forecast"),
             Cell(depth_map(frame.depth), "depth (black: unknown)"),
-            Cell(grey(frame.coverage), f"coverage, mean {frame.coverage.mean():.1%} (black: never seen, filled)"),
+            Cell(grey(frame.coverage), f"coverage, mean {frame.coverage.mean():.1%} (black: disoccluded, inpainted)"),
         ]
         for step, frame in enumerate(frames, start=1)
     ]

@@ -1,7 +1,7 @@
-"""Cameras to show a forecast from, told in a few words: "source", "right", "left" or "0.5,0,0,yaw=-5".
+"""Cameras to show a forecast from, given in a few words: "source", "right", "left" or "0.5,0,0,yaw=-5".
 
 A camera stands at x metres to the right, y down and z forward of the source camera, along the source camera's axes,
-and is turned: yaw > 0 to the right, pitch > 0 up, roll > 0 clockwise (its right side goes down, so the picture turns
+and is turned: yaw > 0 to the right, pitch > 0 up, roll > 0 clockwise (its right side goes down, so the image turns
 counter-clockwise). Roll comes first, yaw last:
 
     next_from_tgt = [[R_y(yaw) R_x(pitch) R_z(roll), (x, y, z)], [0, 1]]        tgt_from_next = next_from_tgt^-1
@@ -21,28 +21,28 @@ from vestcl.data import calibration
 from vestcl.data.sample import Clip, RightCamera, Sample
 from vestcl.forecasting.result import View
 
-#: What stands after the three numbers: three angles, the field of view, the name.
+#: What follows the three numbers: three angles, the field of view, the name.
 _ANGLES: Final = ("yaw", "pitch", "roll")
 _KEYS: Final = (*_ANGLES, "fov", "name")
 
 #: A view's name is a folder's, so it neither leads elsewhere nor hides.
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}")
 
-_WANTED: Final = (
+_EXPECTED: Final = (
     '"source", "right", "left" or "x,y,z[,yaw=deg][,pitch=deg][,roll=deg][,fov=deg][,name=...]" with metres to the '
     "right, down and forward"
 )
 
 
 def parse_view(text: str, camera: Clip | Sample) -> View:
-    """The camera that ``text`` tells.
+    """The camera that ``text`` describes.
 
     - "source": the source camera itself, tgt_from_next = I.
     - "right": the right camera of the stereo rig, tgt_from_next = right_from_left, with its own K.
     - "left": as far to the left as the right camera is to the right, tgt_from_next = right_from_left^-1, with the
       source's K. No camera was ever there.
     - "x,y,z", and after it in any order "yaw=", "pitch=", "roll=", "fov=" (degrees) and "name=": a camera moved and
-      turned as the head of this file tells. ``fov`` is horizontal: fx = W / (2 tan(fov / 2)), fy = fx fy0 / fx0 (the
+      turned as the head of this file says. ``fov`` is horizontal: fx = W / (2 tan(fov / 2)), fy = fx fy0 / fx0 (the
       pixels keep their shape), with the source's principal point. Without ``name`` it is made of what differs from the
       source, "x0.5_yaw-5".
 
@@ -55,7 +55,7 @@ def parse_view(text: str, camera: Clip | Sample) -> View:
 
     Raises:
         ValueError: another word, a number that is none, an angle or name out of range, or a clip without a right
-            camera; the message tells what is wanted.
+            camera; the message says what is expected.
     """
     sample = camera if isinstance(camera, Sample) else camera[0]
     word = text.strip()
@@ -87,7 +87,7 @@ def parse_views(texts: Iterable[str], camera: Clip | Sample) -> list[View]:
 
 
 def seen_by(view: View, sample: Sample) -> Sample | RightCamera | None:
-    """The camera of the rig that stands where ``view`` does, whatever the view is called: its pictures are the truth.
+    """The camera of the rig that stands where ``view`` does, whatever the view is called: its images are the truth.
 
     Args:
         view: a camera.
@@ -107,7 +107,7 @@ def seen_by(view: View, sample: Sample) -> Sample | RightCamera | None:
 
 
 def check_name(name: str) -> None:
-    """Refuse a view's name that is no plain folder name.
+    """Refuse a view's name that is not a plain folder name.
 
     Raises:
         ValueError: empty, of more than 100 letters, with something else than letters, digits and "._+-", with one of
@@ -132,7 +132,7 @@ def _of_rig(word: str, sample: Sample) -> View:
 
 def _numbers(text: str, words: list[str]) -> NDArray[np.float64]:
     if len(words) != 3:
-        raise ValueError(f"`view` must be {_WANTED}, got {text!r}")
+        raise ValueError(f"`view` must be {_EXPECTED}, got {text!r}")
     return np.array([_number(text, word) for word in words])
 
 
@@ -142,7 +142,7 @@ def _number(text: str, word: str) -> float:
     except ValueError:
         number = np.nan
     if not np.isfinite(number):
-        raise ValueError(f"`view` must be {_WANTED}, got {text!r}: {word!r} is no finite number")
+        raise ValueError(f"`view` must be {_EXPECTED}, got {text!r}: {word!r} is not a finite number")
     return number
 
 
@@ -177,7 +177,7 @@ def _zoomed(text: str, fov: str, sample: Sample) -> NDArray[np.float64]:
 
 
 def _default_name(position: NDArray[np.float64], angles: dict[str, float], fov: str | None) -> str:
-    told = dict(zip("xyz", position, strict=True)) | angles
-    parts = [f"{key}{value:g}" for key, value in told.items() if value]
+    offsets = dict(zip("xyz", position, strict=True)) | angles
+    parts = [f"{key}{value:g}" for key, value in offsets.items() if value]
     parts += [] if fov is None else [f"fov{float(fov):g}"]
     return "_".join(parts) or "x0"

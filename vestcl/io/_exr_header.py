@@ -11,7 +11,7 @@ from typing import Final
 
 _MAGIC: Final = b"\x76\x2f\x31\x01"
 
-#: Flags in the version: deep or other data that is no image, and several parts.
+#: Flags in the version: deep or other data that is not an image, and several parts.
 _DEEP, _PARTS = 0x800, 0x1000
 
 #: Bytes that a name may have.

@@ -1,7 +1,7 @@
 """What an image's file states before anything is decoded: its size, and whether the file is whole.
 
-Decoders allocate what a header claims, and some of them take a truncated file without a word. So the size is held
-against `MAX_PIXELS` first, a PNG against the checksums of its chunks, and a JPEG is followed up to its last marker.
+Decoders allocate what a header claims, and some of them take a truncated file without a word. So the size is compared
+with `MAX_PIXELS` first, a PNG against the checksums of its chunks, and a JPEG is followed up to its last marker.
 """
 
 import io
@@ -19,7 +19,7 @@ MAX_PIXELS: Final = 1 << 26
 #: Pixels of its longest side.
 MAX_SIDE: Final = 1 << 16
 
-#: Scans of a progressive JPEG: encoders write about ten, and each is another pass over the image.
+#: Scans of a progressive JPEG: encoders write about ten, and each is another skip the image.
 _MAX_SCANS: Final = 100
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
@@ -42,7 +42,7 @@ def checked_size(path: str | Path, content: bytes) -> tuple[int, int]:
         content: of the file.
 
     Raises:
-        ValueError: no such header, or more than MAX_PIXELS pixels or MAX_SIDE a side.
+        ValueError: no such header, or more than MAX_PIXELS pixels or MAX_SIDE per side.
     """
     try:
         if content.startswith(_PNG):
@@ -52,7 +52,7 @@ def checked_size(path: str | Path, content: bytes) -> tuple[int, int]:
         else:
             size = _other_size(content)
     except (_DamagedError, struct.error) as error:
-        raise ValueError(f"{path}: is no image, or a damaged one") from error
+        raise ValueError(f"{path}: is not an image, or a damaged one") from error
     check_size(path, *size)
     return size
 
@@ -64,7 +64,7 @@ def check_size(path: str | Path, height: int, width: int) -> None:
         ValueError: a side below 1 px or above MAX_SIDE, or more than MAX_PIXELS pixels.
     """
     if min(height, width) < 1 or max(height, width) > MAX_SIDE or height * width > MAX_PIXELS:
-        limit = f"1 to {MAX_SIDE} pixels a side and at most {MAX_PIXELS} in all"
+        limit = f"1 to {MAX_SIDE} pixels per side and at most {MAX_PIXELS} in all"
         raise ValueError(f"{path}: must have {limit}, got {height} x {width} (height x width)")
 
 
@@ -80,11 +80,11 @@ def check_whole(path: str | Path, content: bytes) -> None:
         elif content.startswith(_JPEG):
             _check_jpeg(content)
     except (_DamagedError, struct.error) as error:
-        raise ValueError(f"{path}: is no image, or a damaged one") from error
+        raise ValueError(f"{path}: is not an image, or a damaged one") from error
 
 
 class _DamagedError(Exception):
-    """Why a file is no image, or not all of one."""
+    """Why a file is not an image, or not all of one."""
 
 
 # ---------------------------------------------------------------- PNG: chunks of length, type, data and checksum

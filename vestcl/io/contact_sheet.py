@@ -1,6 +1,6 @@
-"""Pictures of pictures: colour maps for depth and error, and sheets of labelled pictures in rows and columns.
+"""Images of images: colour maps for depth and error, and sheets of labelled images in rows and columns.
 
-A picture here is [H, W, 3] uint8 RGB, ready for `vestcl.io.write_pixels`.
+An image here is [H, W, 3] uint8 RGB, ready for `vestcl.io.write_pixels`.
 """
 
 from collections.abc import Sequence
@@ -28,10 +28,10 @@ WORST_ERROR: Final = 0.25
 DEPTH_COLOURS: Final = "turbo"
 ERROR_COLOURS: Final = "inferno"
 
-#: Widest picture of a sheet, px: five in a row still fit a screen of 2,560.
+#: Widest image of a sheet, px: five in a row still fit a screen of 2,560.
 CELL_WIDTH: Final = 500
 
-#: What pictures lie on: light, so that letters can be read, and not white, so that a white picture shows its edge.
+#: What images lie on: light, so that letters can be read, and not white, so that a white image shows its edge.
 PAPER: Final = (232, 232, 232)
 
 #: Letters and the strip they stand in, px: legible where the sheet is shown at half its size.
@@ -42,13 +42,13 @@ _INDENT: Final = 4
 #: A colour scale's strip, px, and the widest that it gets with its words: an eye takes it in at once.
 _BAR_HEIGHT: Final = 14
 _BAR_WIDTH: Final = 900
-#: Its shortest strip, px: below, its colours can't be told apart.
+#: Its shortest strip, px: below, its colours can't be distinguished.
 _BAR_SHORTEST: Final = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """A picture of a sheet and the line above it."""
+    """An image of a sheet and the line above it."""
 
     picture: Picture
     label: str = ""
@@ -134,12 +134,12 @@ def heat(error: ArrayLike, worst: float = WORST_ERROR) -> Picture:
 
 
 def scale_bar(width: int, low: str, high: str, colours: str = ERROR_COLOURS) -> Picture:
-    """A strip of a colour map from left to right, with the words for its ends beside it.
+    """A strip of a colour map from left to right, with the words for its ends next to it.
 
     Args:
         width: px, of all of it.
-        low: beside the colour of 0.
-        high: beside the colour of 1.
+        low: label at the colour of 0.
+        high: label at the colour of 1.
         colours: a colour map of matplotlib's.
 
     Returns:
@@ -151,14 +151,14 @@ def scale_bar(width: int, low: str, high: str, colours: str = ERROR_COLOURS) -> 
     if colours not in matplotlib.colormaps:
         raise ValueError(f"`colours` must be a colour map of matplotlib's, got {colours!r}")
     left, right = _beside_bar(low), _beside_bar(high)
-    room = width - left - right
-    if room < _BAR_SHORTEST:
+    width_left = width - left - right
+    if width_left < _BAR_SHORTEST:
         raise ValueError(f"`width` must be {_narrowest_bar(low, high)} or more for these words, got {width}")
     canvas = Image.new("RGB", (width, _LINE), PAPER)
     draw = ImageDraw.Draw(canvas)
     draw.text((_GAP, _LINE / 2), low, fill="black", font=_font(), anchor="lm")
     draw.text((width - _GAP, _LINE / 2), high, fill="black", font=_font(), anchor="rm")
-    ramp = np.broadcast_to(np.linspace(0, 1, room), (_BAR_HEIGHT, room))
+    ramp = np.broadcast_to(np.linspace(0, 1, width_left), (_BAR_HEIGHT, width_left))
     canvas.paste(Image.fromarray(_coloured(ramp, colours)), (left, (_LINE - _BAR_HEIGHT) // 2))
     return np.asarray(canvas)
 
@@ -179,20 +179,20 @@ def sheet(
     bar: tuple[str, str] | tuple[str, str, str] | None = None,
     cell_width: int = CELL_WIDTH,
 ) -> Picture:
-    """Rows of pictures on PAPER, each with its label above it.
+    """Rows of images on PAPER, each with its label above it.
 
     Args:
-        rows: of one length; None leaves a place empty. Pictures of one column may differ in height.
+        rows: of one length; None leaves a place empty. Images of one column may differ in height.
         title: a line above all.
-        bar: words for the ends of a colour scale below, and its colour map where that is not `heat`'s. Narrow pictures
-            get PAPER beside them where it is wider.
-        cell_width: px; wider pictures shrink to it (mean over area), narrower ones stay.
+        bar: words for the ends of a colour scale below, and its colour map where that is not `heat`'s. Narrow images
+            get PAPER next to them where it is wider.
+        cell_width: px; wider images shrink to it (mean over area), narrower ones stay.
 
     Returns:
         [H, W, 3].
 
     Raises:
-        ValueError: no picture, rows of several lengths, a picture of another shape or dtype, or ``cell_width`` below 1.
+        ValueError: no image, rows of several lengths, an image of another shape or dtype, or ``cell_width`` below 1.
     """
     _check_rows(rows, cell_width)
     cells = [[None if cell is None else _shrunk(cell, cell_width) for cell in row] for row in rows]
@@ -229,13 +229,13 @@ def _draw(canvas: Image.Image, y: int, cells: list[list[Cell | None]], widths: l
 def _check_rows(rows: Sequence[Sequence[Cell | None]], cell_width: int) -> None:
     lengths = sorted({len(row) for row in rows})
     if len(lengths) != 1 or not any(cell for row in rows for cell in row):
-        raise ValueError(f"`rows` must be of one length and have a picture, got lengths {lengths}")
+        raise ValueError(f"`rows` must be of one length and have an image, got lengths {lengths}")
     if cell_width < 1:
         raise ValueError(f"`cell_width` must be 1 or more, got {cell_width}")
     for picture in (cell.picture for row in rows for cell in row if cell):
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
             got = f"{picture.dtype} {list(picture.shape)}"
-            raise ValueError(f"`rows` must have pictures [H, W, 3] uint8, got {got}")
+            raise ValueError(f"`rows` must have images [H, W, 3] uint8, got {got}")
 
 
 def _shrunk(cell: Cell, width: int) -> Cell:

@@ -1,6 +1,6 @@
 """Depth maps in files: 16-bit PNG with a scale, OpenEXR, NPY, and Cityscapes disparity.
 
-Every reader answers z-depth in metres, float32 [H, W], in which 0 stands for "not known": a pixel is valid iff
+Every reader answers z-depth in metres, float32 [H, W], in which 0 means "not known": a pixel is valid iff
 depth > 0. What a file marks invalid, and whatever is NaN, infinite or negative, becomes 0.
 """
 
@@ -143,9 +143,9 @@ def _read_npy(path: str | Path) -> NDArray[np.generic]:
     try:
         shape, fortran, dtype, start = _npy_header(content)
     except Exception as error:  # NumPy evaluates the header, so that damage may raise anything
-        raise ValueError(f"{path}: is no NPY array, or a damaged one ({error})") from error
+        raise ValueError(f"{path}: is not an NPY array, or a damaged one ({error})") from error
     if dtype.hasobject:
-        raise ValueError(f"{path}: is no NPY array, or a damaged one (it holds Python objects)")
+        raise ValueError(f"{path}: is not an NPY array, or a damaged one (it holds Python objects)")
     if dtype.kind not in "fui":
         raise ValueError(f"{path}: must hold one array of numbers, got {dtype}")
     if len(shape) != 2 and not (len(shape) == 3 and shape[0] == 1):
@@ -154,7 +154,7 @@ def _read_npy(path: str | Path) -> NDArray[np.generic]:
     check_size(path, height, width)
     if len(content) - start != height * width * dtype.itemsize:
         held = f"{height} x {width} {dtype} after {start} bytes of header, got {len(content)} bytes in all"
-        raise ValueError(f"{path}: is no NPY array, or a damaged one (its header states {held})")
+        raise ValueError(f"{path}: is not an NPY array, or a damaged one (its header states {held})")
     values = np.frombuffer(content, dtype, offset=start)
     return values.reshape((width, height)).T if fortran else values.reshape((height, width))
 

@@ -108,10 +108,10 @@ def read_exr(path: str | Path) -> dict[str, NDArray[np.generic]]:
             header = dict(file.header())
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # the library raises what its file's damage leads it to
-        raise ValueError(f"{path}: is no OpenEXR image, or a damaged one ({error})") from error
+        raise ValueError(f"{path}: is not an OpenEXR image, or a damaged one ({error})") from error
     (left, top), (right, bottom) = (np.asarray(corner).tolist() for corner in header["dataWindow"])
     if not np.array_equal(header["dataWindow"], header["displayWindow"]):
-        raise ValueError(f"{path}: its data window must be its display window; write the whole picture")
+        raise ValueError(f"{path}: its data window must be its display window; write the whole image")
     for name, channel in channels.items():
         if channel.shape != (bottom - top + 1, right - left + 1):
             raise ValueError(f"{path}: channel `{name}` is subsampled or damaged, {list(channel.shape)}")
@@ -122,7 +122,7 @@ def write_exr_frame(path: str | Path, frame: ExrFrame) -> None:
     """Write a frame's channels as float32, colour linearised, atomically.
 
     Raises:
-        ValueError: an array of another shape than `ExrFrame` tells, sizes that differ, or nothing to write.
+        ValueError: an array of another shape than `ExrFrame` documents, sizes that differ, or nothing to write.
         OSError: as `write_exr`.
     """
     channels: dict[str, NDArray[np.float32]] = {}
@@ -172,7 +172,7 @@ def _check_claims(path: str | Path, content: bytes) -> None:
     try:
         parts = read_parts(content)
     except ValueError as error:
-        raise ValueError(f"{path}: is no OpenEXR image, or a damaged one ({error})") from error
+        raise ValueError(f"{path}: is not an OpenEXR image, or a damaged one ({error})") from error
     if len(parts) != 1:
         raise ValueError(f"{path}: must have one part, got {len(parts)}")
     (part,) = parts
@@ -183,7 +183,7 @@ def _check_claims(path: str | Path, content: bytes) -> None:
     try:
         check_chunks(content, part)
     except ValueError as error:
-        raise ValueError(f"{path}: is no OpenEXR image, or a damaged one ({error})") from error
+        raise ValueError(f"{path}: is not an OpenEXR image, or a damaged one ({error})") from error
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""PNG and JPEG as arrays, with 8 or 16 bits a channel."""
+"""PNG and JPEG as arrays, with 8 or 16 bits per channel."""
 
 from pathlib import Path
 from typing import Final
@@ -42,9 +42,9 @@ def read_pixels(path: str | Path, size: tuple[int, int] | None = None) -> Pixels
     except cv2.error:
         pixels = None
     if pixels is None or pixels.shape[:2] != got:
-        raise ValueError(f"{path}: is no image, or a damaged one")
+        raise ValueError(f"{path}: is not an image, or a damaged one")
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{path}: must have 8 or 16 bits a channel, got {pixels.dtype}")
+        raise ValueError(f"{path}: must have 8 or 16 bits per channel, got {pixels.dtype}")
     if pixels.ndim == 3:
         code = cv2.COLOR_BGRA2RGB if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB
         pixels = cv2.cvtColor(pixels, code)

@@ -17,7 +17,7 @@ from vestcl.io.atomic import read_bytes
 from vestcl.io.images import read_pixels
 
 LabelKind = Literal["trainIds", "labelIds", "virtual_kitti"]
-"""How a PNG tells classes: Cityscapes train ids, Cityscapes label ids, or Virtual KITTI 2's colours."""
+"""How a PNG encodes classes: Cityscapes train ids, Cityscapes label ids, or Virtual KITTI 2's colours."""
 
 #: The train id of what belongs to no class.
 VOID: Final = 255
@@ -111,7 +111,7 @@ def _read_ids(path: str | Path) -> NDArray[np.uint8]:
         with Image.open(io.BytesIO(content)) as image:
             mode, ids = image.mode, np.array(image)
     except Exception as error:  # Pillow's plugins raise what their format's damage leads them to
-        raise ValueError(f"{path}: is no image, or a damaged one") from error
+        raise ValueError(f"{path}: is not an image, or a damaged one") from error
     if mode not in ("L", "P"):
         raise ValueError(f"{path}: label ids must be an 8-bit image of one channel, got mode {mode}")
     return ids.astype(np.uint8, copy=False)
@@ -130,7 +130,7 @@ def _from_colours(path: str | Path) -> NDArray[np.uint8]:
         known |= here
     if not known.all():
         strange = tuple(pixels[~known][0].tolist())
-        raise ValueError(f"{path}: {strange} is no colour of Virtual KITTI's classes")
+        raise ValueError(f"{path}: {strange} is not a colour of Virtual KITTI's classes")
     return ids
 
 

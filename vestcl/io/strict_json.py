@@ -48,7 +48,7 @@ def read_object(path: Path, largest: int = LARGEST, wanted: str = "an object") -
 
 
 def _refuse_constant(word: str) -> NoReturn:
-    raise JsonError(f"{word} is no number in JSON")
+    raise JsonError(f"{word} is not a number in JSON")
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

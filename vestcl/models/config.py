@@ -7,9 +7,9 @@
     +colour                 colour, coverage and inverse depth are rendered, too: 37 channels a side in place of 32
     +features-only          the features and nothing else are rendered, as vest-paper does
     +joint                  both clouds splatted together in one depth-ordered pass
-    +residual               refinement adds to the splatted colour instead of painting anew
+    +residual               refinement adds to the splatted colour instead of predicting RGB directly
     +filled                 it adds to that colour divided by coverage, holes filled from what surrounds them
-    +painting               it paints anew
+    +painting               it predicts RGB directly
     +from-rest              motion starts from rest, not from what was measured
     +from-prior             motion starts from what was measured: see `MotionPrior`
     +feedback  +compose     how later frames are forecast by default; without them as `ModelConfig.mode` says
@@ -78,7 +78,7 @@ class EncoderConfig:
     features: int = 32
     """Channels out."""
     background: Literal["own", "frame"] = "own"
-    """"own": the inpainted background is a picture of its own. "frame": it is normalised by its frame's statistics, and
+    """"own": the inpainted background is an image of its own. "frame": it is normalised by its frame's statistics, and
     where it is the frame itself, so are its features: then it need only be encoded where they differ."""
 
 
@@ -165,7 +165,7 @@ class RenderConfig:
     inpainted: Literal["own", "last", "inner"] = "own"
     """"own": the background behind a frame's foreground is part of that frame's cloud, at its own depth. "last": only
     the current frame's is shown, as part of the previous frame's cloud, and behind all that this one has seen. "inner":
-    and where the current frame leaves a hole inside the picture that is no crack; needs ``previous`` "uncovered"."""
+    and where the current frame leaves a hole inside the image that is not a crack; needs ``previous`` "uncovered"."""
     previous: Literal["all", "uncovered"] = "all"
     """"uncovered": the previous frame's cloud shows only where the current one's covers less than OPAQUE."""
     normalised: bool = False

@@ -126,9 +126,9 @@ class Forecaster(
             views: the cameras to show, as (tgt_from_next [B, 4, 4], K [B, 3, 3]), each at its own future time; None
                 is the source camera alone; none at all forecasts motion, with "compose" alone.
             mode: "feedback" takes each forecast frame, as the source camera sees it, for an input of the next step;
-                no gradient passes from step to step. "compose" encodes nothing anew: the camera goes on as was forecast
-                at t, and repeats its last motion beyond that; objects repeat their own motion in the world. None is
-                `ModelConfig.default_mode`.
+                no gradient passes from step to step. "compose" encodes nothing again: the camera continues as was
+                forecast at t, and repeats its last motion beyond that; objects repeat their motion in the world. None
+                is `ModelConfig.default_mode`.
             perceive: for "feedback", (image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W])
                 -> layers of that forecast frame; None is `perceive_forecast`.
             prior: motion that was measured, for models that start from it and no others; with "feedback" later steps
@@ -268,7 +268,7 @@ class Forecaster(
                 return cls.load(hf_hub_download(name, WEIGHTS, **options))
             except (HfHubHTTPError, EntryNotFoundError, OSError) as error:
                 reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-                raise ValueError(f"{name}: is no file here, and can't be had from the hub: {reason}") from error
+                raise ValueError(f"{name}: is not a file here, and can't be had from the hub: {reason}") from error
         return cls.load(find_model(name))
 
     def _save_pretrained(self, save_directory: Path) -> None:

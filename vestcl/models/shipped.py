@@ -45,15 +45,15 @@ def find_model(name_or_path: str | Path) -> Path:
             raise ValueError(f"{path}: must have {' or '.join(_OF_A_CHECKPOINT)}, as a training checkpoint has")
         return files[0]
     if not path.is_file():
-        raise ValueError(f"{path}: is no model: no file, no checkpoint's folder, and none of {', '.join(SHIPPED)}")
+        raise ValueError(f"{path}: is not a model: no file, no checkpoint's folder, and none of {', '.join(SHIPPED)}")
     return path
 
 
 def about_model(name_or_path: str | Path) -> dict[str, str]:
-    """What tells this network from any other: {"model_file": the file, "model_sha256": of all its bytes, in hex}.
+    """What identifies this network: {"model_file": the file, "model_sha256": of all its bytes, in hex}.
 
     Args:
-        name_or_path: as of `find_model`; a shipped file is told by its name alone.
+        name_or_path: as of `find_model`; a shipped file is identified by its name only.
 
     Raises:
         ValueError: as `find_model`.

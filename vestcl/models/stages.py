@@ -24,7 +24,7 @@ from vestcl.models.steps.frames import EncodedFrame, grid_depth, grid_mean, with
 from vestcl.models.steps.memory import EncodedFrames, State
 from vestcl.models.steps.motion import Motion, flattened, without_z
 from vestcl.models.steps.move_objects import move_objects, unmoved
-from vestcl.models.steps.prior import MotionPrior, beside
+from vestcl.models.steps.prior import MotionPrior, residual_flow
 from vestcl.models.steps.render import (
     Camera,
     RenderedView,
@@ -116,7 +116,7 @@ class Stages(nn.Module):
         points = unproject(prev.layers.depth, K), unproject(cur.layers.depth, K)
         flows = [rigid_flow(xyz, *rigid) for xyz, rigid in zip(points, to_next[:2], strict=True)]
         flow0 = as_image(torch.cat(flows, dim=2), *cur.features.shape[2:])
-        start = flow0 if prior is None or self.object_motion is None else flow0 + beside(prior, to_next[:2])
+        start = flow0 if prior is None or self.object_motion is None else flow0 + residual_flow(prior, to_next[:2])
         if self.flat:
             flow0, start = flattened(points, flow0), flattened(points, start)
         spans = (2.0 if prior is None else prior.span, 1.0)
@@ -240,7 +240,9 @@ class Stages(nn.Module):
         height, width = sides[0].coverage.shape[2:]
         size = fraction(height, width, self.options.paint_scale)
         if size != (height, width) and self.refine.base == "none":
-            raise ValueError(f"`options.paint_scale` must be 1 for {self.config.name}, which paints anew, got {size}")
+            raise ValueError(
+                f"`options.paint_scale` must be 1 for {self.config.name}, which predicts RGB directly, got {size}"
+            )
         seen = [Side(*(reduced(plane, *size) for plane in side)) for side in sides]
         rendered = side_by_side([refined_channels(side, render.colour, render.normalised) for side in seen])
         with self._autocast():

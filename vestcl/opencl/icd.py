@@ -109,7 +109,7 @@ def _fault(file: Path) -> str:
     try:
         kind = file.stat().st_mode
         if not stat.S_ISREG(kind):
-            return "is a folder" if stat.S_ISDIR(kind) else "is no regular file"
+            return "is a folder" if stat.S_ISDIR(kind) else "is not a regular file"
         with file.open("rb") as opened:
             content = opened.read(_LONGEST + 1)
     except OSError as error:

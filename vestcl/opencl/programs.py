@@ -15,12 +15,12 @@ Defines = Mapping[str, str | int]
 
 @functools.cache
 def kernel_folder() -> Path:
-    """Where the .cl files are: vestcl/kernels in a wheel, kernels/ beside the package in a checkout."""
+    """Where the .cl files are: vestcl/kernels in a wheel, kernels/ next to the package in a checkout."""
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "kernels", package.parent / "kernels"):
         if (folder / "common.h").is_file():
             return folder
-    raise DeviceError(f"vestcl's OpenCL kernels are missing beside {package}: install the package again")
+    raise DeviceError(f"vestcl's OpenCL kernels are missing next to {package}: install the package again")
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""A lock that an interrupt can't leave held, and ``with`` blocks that can tell whether they still run.
+"""A lock that an interrupt can't leave held, and ``with`` blocks that can check whether they still run.
 
 Python raises what a signal handler raises (KeyboardInterrupt) between any two bytecodes: also after ``__enter__`` has
 taken a lock but before the ``with`` statement is set up, and at the first bytecode of ``__exit__``, where no ``try``
@@ -24,7 +24,7 @@ class _ExitOfBlock:
     """``__exit__`` of a `WithBlock`.
 
     A ``with`` statement gets it before it calls ``__enter__``, and holds the only reference, on the stack of its
-    frame, until the block has ended in whichever way. So a weak reference to it tells whether the block still runs.
+    frame, until the block has ended in whichever way. So a weak reference to it shows whether the block still runs.
     """
 
     def __get__(self, block: "WithBlock | None", kind: type["WithBlock"]) -> Exit:

@@ -21,7 +21,7 @@ class use(WithBlock):  # noqa: N801 - reads as a verb, like contextlib.suppress
 
     Args:
         selector: as in `select`.
-        mapping: how work is laid out, "tile" (a work-item a tile, for CPUs) or "pixel" (a work-item a pixel, tile
+        mapping: how work is laid out, "tile" (a work-item per tile, for CPUs) or "pixel" (a work-item per pixel, tile
             lists in local memory, for GPUs); None takes what suits the device's type.
 
     >>> vestcl.use("pocl")  # doctest: +SKIP

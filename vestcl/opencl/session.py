@@ -64,7 +64,7 @@ class Launch:
 
 @dataclass(frozen=True)
 class JobTimes:
-    """One outermost job that an observer is told of: nanoseconds of time.perf_counter_ns."""
+    """One outermost job that an observer is reported: nanoseconds of time.perf_counter_ns."""
 
     session: "Session"
     start_ns: int
@@ -347,12 +347,12 @@ class Job(Holder):
                 session._queue.finish()
             session._finished()
             if session._launched and not failed:
-                self._tell(session._launched)
+                self._notify(session._launched)
         finally:
             session.seconds += (time.perf_counter_ns() - self._started) / 1e9
             session._lock.release(self)
 
-    def _tell(self, launched: list[tuple[str, int, cl.Event]]) -> None:
+    def _notify(self, launched: list[tuple[str, int, cl.Event]]) -> None:
         """The observer, of the launches that are done."""
         observer = _current_observer()
         if observer is not None:

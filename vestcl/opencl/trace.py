@@ -98,7 +98,7 @@ class _Recording:
             self._clocks[times.session] = times.end_ns, ahead
         least = max(one.end_ns for one in times.launches) - times.end_ns
         most = min(one.queued_ns - one.enqueued_ns for one in times.launches)
-        # A driver that doesn't tell when a kernel was queued allows nothing.
+        # A driver that doesn't report when a kernel was queued allows nothing.
         return min(max(ahead, least), most) if least <= most else ahead
 
 

@@ -30,7 +30,7 @@ GPU_GROUP: Final = 64
 
 
 def check_arguments(**arguments: tuple[Any, str]) -> dict[str, int]:
-    """Hold operator arguments against their shapes; the sizes that the letters denote.
+    """Check operator arguments against their shapes; the sizes that the letters denote.
 
     Args:
         **arguments: name = (value, shape), with the shape as words: a number is that size, a letter must mean the
@@ -50,7 +50,7 @@ def check_arguments(**arguments: tuple[Any, str]) -> dict[str, int]:
         if value is None and shape.endswith(OPTIONAL):
             continue
         _check_value(name, value)
-        _check_alike(name, value, first, arguments[first][0])
+        _check_same_kind(name, value, first, arguments[first][0])
         _check_shape(name, list(value.shape), shape.removesuffix(OPTIONAL).split(), sizes, owners)
     return sizes
 
@@ -67,7 +67,7 @@ def _check_value(name: str, value: Any) -> None:
     require_ordinary(name, value)
 
 
-def _check_alike(name: str, value: Any, first: str, leader: Any) -> None:
+def _check_same_kind(name: str, value: Any, first: str, leader: Any) -> None:
     if isinstance(value, torch.Tensor) != isinstance(leader, torch.Tensor):
         raise ValueError(f"`{name}` must be {_kind(leader)} as `{first}` is, got {_kind(value)}")
     if _dtype(value) != _dtype(leader):

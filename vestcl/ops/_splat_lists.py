@@ -12,9 +12,10 @@ Array = np.ndarray[Any, Any]
 
 #: Points that one GPU thread counts and lists: few, for a GPU needs many threads.
 GPU_CHUNK: Final = 256
-#: At most so many counters (chunks x tiles) are kept: 64 MiB.
+#: At most this many counters (chunks x tiles) are kept: 64 MiB.
 MAX_COUNTERS: Final = 1 << 24
-#: A CPU lists at most so many points, with at most so many pairs of a point and a tile, in one launch without a wait.
+#: A CPU lists at most this many points, with at most this many pairs of a point and a tile, in one launch without a
+#: wait.
 FEW_POINTS: Final = 1024
 FEW_PAIRS: Final = 1 << 14
 #: Chunks for each compute unit of a CPU, so that an uneven one does not hold up the others.

@@ -36,7 +36,7 @@ _SEEN: Final = ("image", "K", "size", "depth", "labels", "ego_vehicle", "right")
 #: Bytes of a file that are hashed at once.
 _CHUNK: Final = 1 << 20
 
-#: Told of each frame: whether it was computed (True) or there already.
+#: Called for each frame: whether it was computed (True) or there already.
 Report = Callable[[bool], None]
 
 
@@ -53,7 +53,7 @@ class Outcome:
 
 
 class EightBitPerception(Perception):
-    """Perception of the pictures as the cache holds them, so that nothing in a file is of a picture it lacks.
+    """Perception of the images as the cache holds them, so that nothing in a file is of an image it lacks.
 
     The right camera's are not rounded here: matching takes 8 bits of them anyway.
     """
@@ -76,7 +76,7 @@ def prepare_clip(
 ) -> Outcome | None:
     """Compute what is missing of a clip's cache; afterwards it is complete.
 
-    Files are replaced whole, so that it may be killed at any moment and goes on from there. Frames whose key is the
+    Files are replaced whole, so that it may be killed at any moment and continues from there. Frames whose key is the
     same and which are whole are kept; whatever else has a frame's or clip.json's name, a folder, too, is replaced.
     Processes that prepare one clip at once do so one after the other.
 
@@ -121,7 +121,7 @@ def _complete(
         keys = frame_keys(perception.clip, estimators)
         missing = {index for index, key in enumerate(keys) if not _is_there(clip, folder, index, key)}
     if missing or not (folder / JSON).is_file():
-        _remove(folder / JSON)  # a clip of old and new frames is no clip
+        _remove(folder / JSON)  # a clip of old and new frames is not a clip
     for path in (frame_path(folder, index) for index in missing):
         if not path.is_file():  # a file is replaced in one step, a folder can't be
             _remove(path)
@@ -196,7 +196,7 @@ def _explained(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        why = f"{error.strerror}; what is prepared so far stays, and the same command goes on from there"
+        why = f"{error.strerror}; what is prepared so far stays, and the same command continues from there"
         raise OSError(error.errno, f"can't be written: {why}", str(path)) from error
 
 

@@ -3,11 +3,11 @@
     CLIP-HxW/clip.json           written last, whole or not at all: where it is, the clip is complete
     CLIP-HxW/000000.safetensors  a file a frame
 
-A frame's file holds, with n pixels where M = 0 and m pixels that move beside the camera:
+A frame's file holds, with n pixels where M = 0 and m pixels that moves by itself:
 
     image, right [3, H, W] uint8, x = value / 255        background_image [3, n] uint8, background_depth [n] float32
     depth [H, W] float32, m                              velocity [3, m] float16, m per interval
-    mask, own, moving [ceil(HW / 8)] uint8, a bit a pixel  prev_from_cur [4, 4] float64
+    mask, own, moving [ceil(HW / 8)] uint8, a bit per pixel  prev_from_cur [4, 4] float64
 
 right and prev_from_cur are left out where there is none. Its metadata hold the key of what it was computed
 from (vestcl/prepare/clip.py) and a CRC-32 of every tensor; names, types and shapes are checked against this table.
@@ -32,7 +32,7 @@ from vestcl.io.images import to_pixels
 from vestcl.scene.inputs import Inputs, inputs_of
 from vestcl.scene.perceived import PerceivedFrame
 
-#: Raised when perception, the procedural street or these files change: it makes every frame be computed anew.
+#: Raised when perception, the procedural street or these files change: it makes every frame be computed again.
 RECIPE: Final = "vestcl prepared 4"
 
 JSON: Final = "clip.json"
@@ -157,7 +157,7 @@ def _regular(path: Path) -> Path:
 
     Raises:
         FileNotFoundError: there is nothing of that name.
-        OSError: it is no regular file, or can't be looked at.
+        OSError: it is not a regular file, or can't be looked at.
     """
     path.stat()
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""What `vestcl prepare` computes once, every frame of a clip understood, and how it is read back."""
+"""What `vestcl prepare` computes once, every frame of a clip preprocessed, and how it is read back."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -217,7 +217,7 @@ def _matrix(rows: list[list[float]], side: int) -> NDArray[np.float64]:
 
 
 def _to_float(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """x / 255; torch divides a picture ten times as fast as NumPy."""
+    """x / 255; torch divides an image ten times as fast as NumPy."""
     return torch.from_numpy(pixels).to(torch.float32).div_(255).numpy()
 
 

@@ -17,7 +17,7 @@ import torch
 from vestcl import interrupt
 from vestcl.prepare.clip import Outcome, Report
 
-#: Seconds between two looks at what other processes tell.
+#: Seconds between two looks at what other processes report.
 _TICK: Final = 0.1
 
 
@@ -32,7 +32,7 @@ class Task:
 
 
 @dataclass
-class Told:
+class Summary:
     """What the run comes to."""
 
     computed: int = 0
@@ -53,13 +53,13 @@ Work = Callable[[Task, bool, Report], Outcome | None]
 Advance = Callable[[], None]
 
 
-def run_tasks(tasks: Sequence[Task], work: Work, told: Told, advance: Advance, workers: int) -> None:
+def run_tasks(tasks: Sequence[Task], work: Work, summary: Summary, advance: Advance, workers: int) -> None:
     """First the clips that no other process is at, then the rest.
 
     Args:
-        tasks: one a clip.
+        tasks: one per clip.
         work: what is done for each.
-        told: is added to; a ValueError becomes one of its failures.
+        summary: is added to; a ValueError becomes one of its failures.
         advance: called after each frame.
         workers: 1 works in this process.
 
@@ -67,12 +67,12 @@ def run_tasks(tasks: Sequence[Task], work: Work, told: Told, advance: Advance, w
         OSError: a frame can't be written, or a process was killed.
     """
     if workers == 1:
-        _run_here(tasks, work, told, advance)
+        _run_here(tasks, work, summary, advance)
     else:
-        _run_apart(tasks, work, told, advance, workers)
+        _run_apart(tasks, work, summary, advance, workers)
 
 
-def _run_here(tasks: Sequence[Task], work: Work, told: Told, advance: Advance) -> None:
+def _run_here(tasks: Sequence[Task], work: Work, summary: Summary, advance: Advance) -> None:
     """First the clips that no other process is at, then the rest."""
     for waits in (False, True):
         later = []
@@ -80,16 +80,16 @@ def _run_here(tasks: Sequence[Task], work: Work, told: Told, advance: Advance) -
             try:
                 outcome = work(task, waits, lambda computed: advance())
             except ValueError as error:
-                told.failures.append(str(error))
+                summary.failures.append(str(error))
                 continue
             if outcome is None:
                 later.append(task)
             else:
-                told.add(outcome)
+                summary.add(outcome)
         tasks = later
 
 
-def _run_apart(tasks: Sequence[Task], work: Work, told: Told, advance: Advance, workers: int) -> None:
+def _run_apart(tasks: Sequence[Task], work: Work, summary: Summary, advance: Advance, workers: int) -> None:
     """The same in processes of their own."""
     spawn = multiprocessing.get_context("spawn")
     frames: multiprocessing.Queue[bool] = spawn.Queue()
@@ -99,7 +99,7 @@ def _run_apart(tasks: Sequence[Task], work: Work, told: Told, advance: Advance, 
             for waits in (False, True):
                 with interrupt.shielded():  # which starts the processes
                     futures = {pool.submit(_work, work, task, waits): task for task in tasks}
-                tasks = [futures[done] for done in _finished(futures, frames, advance) if _is_busy(done, told)]
+                tasks = [futures[done] for done in _finished(futures, frames, advance) if _is_busy(done, summary)]
         except BaseException as error:
             if interrupt.is_interrupt(error):  # nobody waits for the clips that are being prepared
                 for process in set(multiprocessing.active_children()) - others:
@@ -108,17 +108,17 @@ def _run_apart(tasks: Sequence[Task], work: Work, told: Told, advance: Advance, 
             raise
 
 
-def _is_busy(done: "Future[Outcome | None]", told: Told) -> bool:
+def _is_busy(done: "Future[Outcome | None]", summary: Summary) -> bool:
     """Notes what a process came to; whether another one is at its clip."""
     try:
         outcome = done.result()
     except BrokenProcessPool as error:
         raise ChildProcessError("a worker was killed, perhaps for memory; fewer `--workers` need less") from error
     except ValueError as error:
-        told.failures.append(str(error))
+        summary.failures.append(str(error))
         return False
     if outcome is not None:
-        told.add(outcome)
+        summary.add(outcome)
     return outcome is None
 
 

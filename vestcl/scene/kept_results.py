@@ -6,7 +6,7 @@ from typing import Any, Final, TypeVar
 
 from vestcl.clock import Clock
 
-#: Results of so many frames before the last one asked for are kept; a forecast looks at three.
+#: Results of this many frames before the last one asked for are kept; a forecast looks at three.
 _KEPT: Final = 4
 
 Result = TypeVar("Result")

@@ -100,7 +100,7 @@ def batch(frames: Sequence[Layers]) -> LayerBatch:
         frames: one or more, of one size.
 
     Returns:
-        Tensors of their own memory, on the CPU.
+        Tensors with their own memory, on the CPU.
 
     Raises:
         ValueError: no frame, or frames of several sizes.

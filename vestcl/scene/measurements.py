@@ -31,11 +31,11 @@ _INVERSE_STD: Final = 0.002
 #: Depth maps with a smaller share of valid pixels are scans, to be densified.
 _DENSE: Final = 0.3
 
-#: From so many intervals on there is a gap between two frames. It is too long if flow is believed (its error forth and
-#: back, px) at less than that share of the pixels that it is believed at between the two frames before.
+#: From this many intervals on there is a gap between two frames. It is too long if flow is believed (its error forth
+#: and back, px) at less than that share of the pixels that it is believed at between the two frames before.
 _GAP, _BELIEVED, _LOST = 1.5, 1.0, 0.6
 
-#: A bonnet is looked for in so many last images.
+#: A bonnet is looked for in this many of the last images.
 _COMPARED: Final = 4
 
 _LOG: Final = logging.getLogger(__name__)
@@ -225,8 +225,8 @@ class Measurements(KeptResults):
         if index == 0:  # nothing is before it, so what comes after has to do
             return self.once("motion depth", 0, lambda: motion_depth([self.image(1), self.image(0)], self.clip[0].K))
         if self.is_lost(index):
-            alone = [self.image(index)] * 2
-            return self.once("motion depth", index, lambda: motion_depth(alone, self.clip[index].K))
+            still = [self.image(index)] * 2
+            return self.once("motion depth", index, lambda: motion_depth(still, self.clip[index].K))
         first = index - 1 if self.is_lost(index - 1) else max(index - 2, 0)
         images = [self.image(i) for i in range(first, index + 1)]
         known = self.correspondence(index)

@@ -14,7 +14,7 @@ _WIDTH, _LOWER = 416, 0.2
 #: Pairs of frames that are compared at least: asphalt may look alike in two.
 PAIRS: Final = 2
 
-#: An edge, grey levels (0 to 1) a pixel, is static if it seems to move by less than so many pixels across itself.
+#: An edge, grey levels (0 to 1) per pixel, is static if it seems to move by less than this many pixels across itself.
 _EDGE, _STATIC = 0.015, 0.25
 
 #: What crossing a column costs where no static edge is, where the bonnet is out of the image, and a step of a row.
@@ -27,7 +27,7 @@ _LOW, _NOTCH = 1.0, 0.2
 #: The bonnet's rim must be seen in so much of the width, and be a static edge in so much of that.
 _WIDE, _EDGES = 0.5, 0.7
 
-#: Of the edges below the rim so many are static, of those above, up to the horizon, at most so many.
+#: Of the edges below the rim this many are static, of those above, up to the horizon, at most this many.
 _BELOW, _ABOVE = 0.2, 0.3
 
 #: Below a border row no bonnet is seen: it has that many rows at least, as a share of the height.

@@ -26,7 +26,7 @@ class Surface:
 class Moving:
     """The objects of a frame."""
 
-    things: NDArray[np.int32]
+    instances: NDArray[np.int32]
     """[H, W], 0 = background, else the object."""
     velocity: NDArray[np.float32]
     """As of `PerceivedFrame`."""

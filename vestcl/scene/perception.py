@@ -142,9 +142,9 @@ class Perception(Measurements):
 
     def _find_moving(self, index: int) -> Moving:
         surface, K = self.surface(index), self.clip[index].K
-        things = objects.segment(surface.mask, surface.depth)
+        instances = objects.segment(surface.mask, surface.depth)
         if index == 0:
-            return Moving(things, np.zeros_like(surface.image))
+            return Moving(instances, np.zeros_like(surface.image))
         depth = self.raw_depth(index)
         # Two depths whose scales may differ by more than an object moves say nothing.
         scaled = self.is_monocular(index) or self.is_monocular(index - 1)
@@ -152,11 +152,11 @@ class Perception(Measurements):
         measured = depth, before, self.inverse_std(index)
         motion = self.correspondence(index), self.prev_from_cur(index), K
         pair = Pair(surface.image, self.image(index - 1), self.prev_from_cur(index), K)
-        by_thing = search(things, objects.velocities(things, *measured, *motion), depth, pair)
-        velocity = by_thing.astype(np.float32)[things].transpose(2, 0, 1)
+        by_instance = search(instances, objects.velocities(instances, *measured, *motion), depth, pair)
+        velocity = by_instance.astype(np.float32)[instances].transpose(2, 0, 1)
         by_flow = objects.follow_flow(velocity, surface.image, surface.depth, self._flow(index), *motion[1:])
         velocity = confirmed(by_flow, velocity, surface.depth, pair)
-        return Moving(things, velocity / np.float32(self.clip.elapsed(index)))
+        return Moving(instances, velocity / np.float32(self.clip.elapsed(index)))
 
     def _see(self, index: int) -> PerceivedFrame:
         surface, complete = self.surface(index), self._complete_depth(index)

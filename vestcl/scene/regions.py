@@ -18,7 +18,7 @@ _DEPTH: Final = 60.0
 #: SLIC's weight of nearness against likeness, in units of CIELAB, and its rounds: half of scikit-image's ten, for time.
 _COMPACTNESS, _ROUNDS = 10.0, 5
 
-#: Depths are compared up to so many metres: the sky is no farther than what is before it.
+#: Depths are compared up to this many metres: the sky is no farther than what is before it.
 _NEAREST, _FARTHEST = 1.0, 200.0
 
 

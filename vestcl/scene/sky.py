@@ -8,21 +8,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import checked
 
-#: Sky is smoother than that after a blur of 1 px: grey levels (0 to 1) a pixel ...
+#: Sky is smoother than that after a blur of 1 px: grey levels (0 to 1) per pixel ...
 _SMOOTH: Final = 0.012
-#: ... and brighter than that share of the picture's 90th percentile.
+#: ... and brighter than that share of the image's 90th percentile.
 _BRIGHT: Final = 0.3
 
 #: Sky is not warmer than that, red less blue, unless it is as good as white: on the street that spares half of the
-#: walls that were taken for sky, and costs nothing on KITTI. Grey pictures pass as they are.
+#: walls that were taken for sky, and costs nothing on KITTI. Grey images pass as they are.
 _WARMEST, _WHITE = 0.02, 0.97
 
 #: Sky does not reach below that share of the height: a car's camera looks ahead.
 _LOWEST: Final = 0.6
 
-#: A region is no sky if most of its known depths are nearer than that, metres, and as much of it is known as that share
-#: of what is known of the whole picture: scanners have no return from the sky, and stereo pairs only stray matches, up
-#: to 0.19 on KITTI odometry, where white walls have 0.7. Its rim, px, does not count: things before it widen there.
+#: A region is not a sky if most of its known depths are nearer than that, metres, and as much of it is known as that
+#: share of what is known of the whole image: scanners have no return from the sky, and stereo pairs only stray matches,
+#: up to 0.19 on KITTI odometry, where white walls have 0.7. Its rim, px, does not count: objects before it widen there.
 _NEAR, _KNOWN_SHARE, _RIM = 80.0, 0.35, 7
 
 #: A stereo pair matches the even sky with whatever is around it: from the 10th to the 90th percentile its depths are a
@@ -34,13 +34,13 @@ _MIDDLE, _AS_BRIGHT = (0.4, 0.6), 0.06
 #: The sky is of one brightness: regions that differ by more from the first are something else. The first is the one
 #: with the most light, area times brightness: shaded walls may be larger than a narrow sky, white ones are brighter.
 #: On the street 0.1 takes half the walls for sky that 0.2 takes.
-_ALIKE: Final = 0.1
+_SIMILAR: Final = 0.1
 
 #: With depth, sky below bridges and between trees, without the border's help: as bright as the sky to that, with less
 #: than that share known. It brings KITTI's frames under a bridge from an IoU of 0.5 to 0.77.
 _SAME, _ENCLOSED_KNOWN = 0.05, 0.02
 
-#: Regions below that share of the picture are left out; enclosed ones may be a fifth of it.
+#: Regions below that share of the image are left out; enclosed ones may be a fifth of it.
 _SMALLEST, _SMALLEST_ENCLOSED = 0.001, 0.0002
 
 
@@ -51,7 +51,7 @@ def sky_mask(image: ArrayLike, depth: ArrayLike | None = None, *, matched: bool 
 
     Args:
         image: [3, H, W] RGB in [0, 1].
-        depth: [1, H, W] m, 0 = invalid; bright walls are told from the sky by it.
+        depth: [1, H, W] m, 0 = invalid; bright walls are distinguished from the sky by it.
         matched: ``depth`` is matched in a stereo pair, which has depths in the sky, too, but not those of one surface.
 
     Returns:
@@ -72,7 +72,7 @@ def sky_mask(image: ArrayLike, depth: ArrayLike | None = None, *, matched: bool 
     if matched and metres.any():
         sky = _of_no_surface(candidate, metres, grey)
     else:
-        sky = _alike(_regions(candidate, metres), grey)
+        sky = _similar(_regions(candidate, metres), grey)
     if sky.any() and metres.any():
         sky |= _enclosed(candidate, metres, grey, float(np.median(grey[sky])))
     return _closed(sky, grey, slope)[None]
@@ -140,18 +140,18 @@ def _of_no_surface(
     return np.asarray(keep[labels])
 
 
-def _alike(regions: NDArray[np.int32], grey: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _similar(regions: NDArray[np.int32], grey: NDArray[np.float32]) -> NDArray[np.bool_]:
     """[H, W], True in the first region and in those that are as bright."""
     area = np.bincount(regions.ravel())
     brightness = np.bincount(regions.ravel(), grey.ravel()) / np.maximum(area, 1)
     area[0] = 0
     first = (area * brightness).argmax()
-    keep = (area > 0) & (np.abs(brightness - brightness[first]) < _ALIKE)
+    keep = (area > 0) & (np.abs(brightness - brightness[first]) < _SIMILAR)
     return keep[regions]
 
 
 def _closed(sky: NDArray[np.bool_], grey: NDArray[np.float32], slope: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """The soft rim that the gradient cost: what is beside the sky and as bright as it."""
+    """The soft rim that the gradient cost: what is next to the sky and as bright as it."""
     if not sky.any():
         return sky
     share = cv2.blur(sky.astype(np.float32), (7, 7))

@@ -27,7 +27,7 @@ NATIVE: Final = (1024, 2048)
 BEFORE: Final = 19
 AFTER: Final = 10
 
-#: Frames a second.
+#: Frames per second.
 FPS: Final = 17.0
 
 #: Metres between two cameras of one car, at most.
@@ -59,7 +59,7 @@ def open_cityscapes(path: str | Path, snippet: str | None = None) -> Clip:
         snippet: name of the annotated frame, "frankfurt_000000_000294"; not needed where there is only one.
 
     Raises:
-        ValueError: a file is missing or malformed, or the snippet is not told; the message names it.
+        ValueError: a file is missing or malformed, or the snippet is not known; the message names it.
 
     Source: SPEC section 9; README of the Cityscapes scripts.
     """
@@ -184,7 +184,7 @@ def _read_camera(path: Path) -> _Camera:
         fx, fy, u0, v0 = (_number(inner[key]) for key in ("fx", "fy", "u0", "v0"))
         baseline = _number(content["extrinsic"]["baseline"])
     except (ValueError, TypeError) as error:  # of JSON, of its encoding, of a number
-        raise ValueError(f"{path}: is no Cityscapes camera file ({error})") from error
+        raise ValueError(f"{path}: is not a Cityscapes camera file ({error})") from error
     except KeyError as error:
         raise ValueError(f"{path}: has no {error}") from error
     K = calibration.intrinsics(fx, fy, u0, v0)
@@ -196,7 +196,7 @@ def _read_camera(path: Path) -> _Camera:
 
 def _number(value: Any) -> float:
     if not isinstance(value, int | float) or isinstance(value, bool):
-        raise TypeError(f"{value!r:.40} is no number")
+        raise TypeError(f"{value!r:.40} is not a number")
     try:
         return float(value)
     except OverflowError:

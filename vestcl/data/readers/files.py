@@ -40,7 +40,7 @@ def by_name(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
         suffixes: in lower case; files may have them in any.
 
     Raises:
-        ValueError: it is no folder, can't be read, or has two files of one name.
+        ValueError: it is not a folder, can't be read, or has two files of one name.
     """
     found: dict[str, Path] = {}
     if not is_present(folder):
@@ -109,7 +109,7 @@ def images(folder: Path) -> list[Path]:
     """The images of a folder in natural order of their names, hidden files left out; none where it does not exist.
 
     Raises:
-        ValueError: it is no folder, or has two images of one name.
+        ValueError: it is not a folder, or has two images of one name.
     """
     return list(by_name(folder, IMAGE_SUFFIXES).values())
 
@@ -133,7 +133,7 @@ def numbered(folder: Path, suffixes: Sequence[str], prefix: str = "", gaps: bool
         gaps: whether numbers may be missing between the first and the last.
 
     Raises:
-        ValueError: a name that is no number, two files of one number, or a gap.
+        ValueError: a name that is not a number, two files of one number, or a gap.
     """
     found: dict[int, Path] = {}
     for word, file in by_name(folder, suffixes).items():
@@ -222,10 +222,10 @@ def read_rows(path: Path, columns: Sequence[int], skip: int = 0, *, by_frame: bo
 
 
 def read_poses(path: Path) -> Matrix:
-    """world_from_cam [N, 4, 4] of a file with 12 (3x4) or 16 (4x4) numbers a line, row by row.
+    """world_from_cam [N, 4, 4] of a file with 12 (3x4) or 16 (4x4) numbers per line, row by row.
 
     Raises:
-        ValueError: it can't be read, or a line is no rigid motion.
+        ValueError: it can't be read, or a line is not a rigid motion.
     """
     rows = read_rows(path, (12, 16), by_frame=True)
     poses = np.broadcast_to(np.eye(4), (len(rows), 4, 4)).copy()
@@ -300,7 +300,7 @@ class Calibration:
         """The ``size`` numbers of entry ``name``.
 
         Raises:
-            ValueError: it is not there, or is not so many finite numbers.
+            ValueError: it is not there, or is not this many finite numbers.
         """
         if name not in self._entries:
             raise ValueError(f"{self.path}: has no entry `{name}`; it has {', '.join(self._entries) or 'none'}")
@@ -323,7 +323,7 @@ class Calibration:
         """`split_projection` of the 3x4 entry ``name``.
 
         Raises:
-            ValueError: it is not there, its K is no camera, or its shift is no camera's.
+            ValueError: it is not there, its K is not a camera, or its shift is not a camera's.
         """
         matrix = self.entry(name, 12).reshape(3, 4)
         check_intrinsics(matrix[:, :3], f"{self.path}: `{name}`")

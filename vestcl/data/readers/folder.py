@@ -53,7 +53,7 @@ def open_folder(path: str | Path, fov: float | None = None) -> Clip:
     folder = Path(path)
     frames = frames_of(folder)
     if not frames:
-        raise ValueError(f"{folder}: has no pictures, neither beside camera.json nor in {', '.join(FRAMES)}")
+        raise ValueError(f"{folder}: has no images, neither next to camera.json nor in {', '.join(FRAMES)}")
     size, names = image_size(frames[0]), [frame.stem for frame in frames]
     about = _camera_file(folder, size, fov)
     camera = about.camera.fit(size, about.path)
@@ -99,7 +99,7 @@ def _camera_file(folder: Path, size: tuple[int, int], fov: float | None) -> Came
     path = folder / "camera.json"
     if fov is not None:
         if files.is_present(path):
-            raise ValueError(f"{path}: tells the camera; leave out `fov`")
+            raise ValueError(f"{path}: defines the camera; leave out `fov`")
         return CameraFile(path, LensCamera(calibration.intrinsics_from_fov(fov, *size), size))
     if not files.is_present(path):
         raise ValueError(f"{path}: no such file; write one with fx, fy, cx, cy, or give `fov` in degrees")
@@ -124,7 +124,7 @@ def _depths(folder: Path, names: list[str], about: CameraFile) -> dict[str, Dept
     found = files.next_to(folder / "depth", names, _DEPTHS)
     for path in found.values():
         if path.suffix.lower() == ".png" and about.depth_scale is None:
-            raise ValueError(f"{about.path}: must tell `depth_scale`, file units per metre, for {path}")
+            raise ValueError(f"{about.path}: must contain `depth_scale`, file units per metre, for {path}")
     return {name: DepthFile(path, about.depth_scale) for name, path in found.items()}
 
 
@@ -132,7 +132,7 @@ def _labels(folder: Path, names: list[str], about: CameraFile) -> dict[str, Labe
     found, kind = files.next_to(folder / "labels", names, (".png",)), about.label_ids
     if kind is None:
         for path in found.values():
-            raise ValueError(f"{about.path}: must tell `label_ids` for {path}")
+            raise ValueError(f"{about.path}: must contain `label_ids` for {path}")
         return {}
     return {name: LabelFile(path, kind) for name, path in found.items()}
 
@@ -144,7 +144,7 @@ def _rights(folder: Path, names: list[str], about: CameraFile, left_size: tuple[
         return {}
     first = next(iter(found.values()))
     if about.baseline is None:
-        raise ValueError(f"{about.path}: must tell `baseline` in metres for {first}")
+        raise ValueError(f"{about.path}: must contain `baseline` in metres for {first}")
     size = image_size(first)
     camera = about.right or replace(about.camera, size=about.camera.size or left_size)
     camera = camera.fit(size, about.path)

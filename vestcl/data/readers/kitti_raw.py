@@ -86,7 +86,7 @@ def open_kitti_raw(
     has them at time t, so that they are read only where they are asked for.
 
     Args:
-        path: DATE/DATE_drive_NNNN_sync, with the date's calibration files beside it.
+        path: DATE/DATE_drive_NNNN_sync, with the date's calibration files next to it.
         rig: the colour or the grey cameras.
         first_pose_identity: the world is the first camera; otherwise the Mercator plane, far from its origin.
         accumulated_depth: depth comes from `proj_depth/groundtruth`, of the frames that have a map there.

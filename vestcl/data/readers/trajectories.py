@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 from vestcl.data import calibration
 from vestcl.data.calibration import Matrix
 
-#: Frames a second of KITTI's pose files, which have no times.
+#: Frames per second of KITTI's pose files, which have no times.
 KITTI_FPS: Final = 10.0
 
 #: Numbers in a line: 3 x 4 world_from_cam, or time, position and quaternion (x, y, z, w).
@@ -26,12 +26,12 @@ class Trajectory(NamedTuple):
 
 
 def read_trajectory(path: str | Path, fps: float = KITTI_FPS) -> Trajectory:
-    """Poses of a text file, one a line, empty lines and lines that begin with "#" left out.
+    """Poses of a text file, one per line, empty lines and lines that begin with "#" left out.
 
     Args:
         path: KITTI's (12 numbers, the rows of the 3 x 4 matrix world_from_cam) or TUM's format (timestamp in seconds,
             t_x t_y t_z, q_x q_y q_z q_w of world_from_cam).
-        fps: frames a second of KITTI's format, which has no times.
+        fps: frames per second of KITTI's format, which has no times.
 
     Raises:
         ValueError: fewer than two poses, another number of columns, no rigid motions, or times that do not rise.

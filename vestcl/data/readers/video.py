@@ -11,7 +11,7 @@ from vestcl.data.sample import Clip, Sample
 from vestcl.data.sources import VideoFrame
 from vestcl.io.video.reading import Video
 
-#: Horizontal field of view in degrees where none is told: between dashboard cameras that are sold as wide (their
+#: Horizontal field of view in degrees where none is given: between dashboard cameras that are sold as wide (their
 #: 120 to 140 degrees are diagonal, with distortion) and a telephone's main camera (65).
 FOV: Final = 60.0
 

@@ -19,7 +19,7 @@ from vestcl.io.images import image_size
 #: (height, width) that intrinsic.txt is for.
 NATIVE: Final = (375, 1242)
 
-#: Frames a second, as KITTI's.
+#: Frames per second, as KITTI's.
 FPS: Final = 10.0
 
 

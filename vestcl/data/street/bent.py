@@ -18,7 +18,7 @@ from vestcl.data.street.raycast import COURSE, COURSE_STEP, SOLID, Solids
 
 Array = NDArray[np.float64]
 
-#: Metres of the middle line beyond what is built: the ground goes on.
+#: Metres of the middle line beyond what is built: the ground continues.
 _BEYOND: Final = 40.0
 
 

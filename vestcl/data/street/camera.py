@@ -31,10 +31,10 @@ def are_rigid(poses: Array) -> bool:
 
 
 def check_samples(samples: int) -> None:
-    """Refuse what is no number of rays.
+    """Refuse what is not a number of rays.
 
     Raises:
-        ValueError: ``samples`` is no positive integer.
+        ValueError: ``samples`` is not a positive integer.
     """
     if not isinstance(samples, int | np.integer) or samples < 1:
         raise ValueError(f"`samples` must be a positive integer, got {samples!r}")
@@ -57,10 +57,10 @@ def check_pose(name: str, pose: ArrayLike) -> Array:
 def check_cameras(
     camera_from_world: ArrayLike, K: ArrayLike, height: int, width: int, t: ArrayLike
 ) -> tuple[Array, Array, Array]:
-    """The arguments of `Street.render`, checked and with one entry an image: [B,4,4], [B,3,3] and [B].
+    """The arguments of `Street.render`, checked and with one entry per image: [B,4,4], [B,3,3] and [B].
 
     Raises:
-        ValueError: one of them is no camera, size or time; the message names it.
+        ValueError: one of them is not a camera, size or time; the message names it.
     """
     poses, cameras = np.asarray(camera_from_world, np.float64), np.asarray(K, np.float64)
     times = np.asarray(t, np.float64)

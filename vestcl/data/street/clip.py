@@ -20,7 +20,7 @@ KEPT_FRAMES: Final = 8
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture of the street to be taken. Equal shots share one rendering."""
+    """An image of the street to be taken. Equal shots share one rendering."""
 
     street: Street
     t: float
@@ -116,9 +116,9 @@ def street_clip(
         height: of the images, px.
         width: alike.
         start: seconds.
-        fps: frames a second.
+        fps: frames per second.
         baseline: metres from the left camera to the right one.
-        samples: rays a pixel for colour, see `Street.render`.
+        samples: rays per pixel for colour, see `Street.render`.
         foreground: False leaves out the foreground and its shadows, see `Street.render`.
 
     Raises:

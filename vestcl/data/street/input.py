@@ -24,7 +24,7 @@ MOST_STREETS: Final = 100_000
 RATES: Final = (8.0, 30.0)
 ALL_RATES: Final = (0.1, 240.0)
 
-#: Frames a second without any given.
+#: Frames per second without any given.
 USUAL_RATE: Final = 10.0
 
 #: With random driving, a street's clip starts somewhere in its first minute, so that all phases of its sway come up.
@@ -49,7 +49,7 @@ class Driven:
     """"usual": a straight street, as it has been since version 0.1; "random": the same with the sway of `Sway.drawn`,
     from a random time on; "road": `RoadDrive`."""
     fps: float | str | None = None
-    """Frames a second, or "random"."""
+    """Frames per second, or "random"."""
     depth: str | None = None
     """Where depth comes from: "true", "stereo", "motion" or "scan", or "random": one of the latter three."""
     masks: str | None = None
@@ -134,7 +134,7 @@ def clip(seed: int, driven: Driven, frames: int, size: tuple[int, int], samples:
 
     Args:
         seed: 0 or more.
-        driven: how; nothing given is the usual drive at 10 frames a second with true depth and labels.
+        driven: how; nothing given is the default drive at 10 frames per second with true depth and labels.
         frames: how many.
         size: (height, width) px.
         samples: as `Street.render` has them.
@@ -205,7 +205,7 @@ def rate(value: str, name: str) -> float | str:
     except ValueError:
         number = np.nan
     if not ALL_RATES[0] <= number <= ALL_RATES[1]:
-        wanted = f"{ALL_RATES[0]:g} ... {ALL_RATES[1]:g} frames a second or {RANDOM}"
+        wanted = f"{ALL_RATES[0]:g} ... {ALL_RATES[1]:g} frames per second or {RANDOM}"
         raise ValueError(f"{name} must be {wanted}, got {value!r}")
     return number
 

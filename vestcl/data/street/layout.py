@@ -1,4 +1,4 @@
-"""What stands and moves along the procedural street, and where.
+"""Static and dynamic objects along the procedural street, and where.
 
 The street is built in blocks of BLOCK metres, each from the seed and its own index, so that any stretch of it can be
 built alone; moving cars and pedestrians go in endless files, see vestcl/data/street/driving/traffic.py.
@@ -36,7 +36,7 @@ Part = tuple[Solids, float]
 
 @dataclass(frozen=True)
 class Layout:
-    """What of a street decides where things stand."""
+    """What of a street decides where objects stand."""
 
     seed: int
     kerb: float
@@ -54,13 +54,13 @@ class File:
     """"car" or "pedestrian"."""
     x: float
     speed: float
-    """Mean, metres a second along +z; negative goes and faces the other way."""
+    """Mean, metres per second along +z; negative goes and faces the other way."""
     spacing: float
     gap: int | None = None
     """A slot that stays empty: the camera's own, whose drive this file follows."""
 
 
-# ---------------------------------------------------------------- what stands still
+# ---------------------------------------------------------------- what is static
 
 
 def _rng(seed: int, purpose: int, index: int) -> np.random.Generator:
@@ -139,7 +139,7 @@ def _houses(layout: Layout, rng: np.random.Generator, side: int, length: float) 
 def _furniture(
     layout: Layout, rng: np.random.Generator, side: int, length: float, after_crossing: bool
 ) -> Iterator[Part]:
-    """Trees, lamps and bollards along the kerb, and parked cars beside it."""
+    """Trees, lamps and bollards along the kerb, and parked cars next to it."""
     x = side * (layout.kerb + 0.75)
     for i, z in enumerate(np.arange(4.0, length - 2, 8.0)):
         if i % 3 == 1:

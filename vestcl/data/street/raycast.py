@@ -126,7 +126,7 @@ class Frame:
     labels: NDArray[np.uint8]
     """[B,1,H,W], Cityscapes train ids, see `Label`."""
     instances: NDArray[np.int32] | None = None
-    """[B,1,H,W], one number for each car and person that moves, the same at all times; 0 stands still. None if it was
+    """[B,1,H,W], one number for each car and person that moves, the same at all times; 0: static. None if it was
     not asked for."""
 
 
@@ -177,7 +177,7 @@ def cast(
         K: [3,3] intrinsics in pixels, last row (0, 0, 1).
         frame: where the result goes, from `blank_frame`.
         index: which image of the batch.
-        samples: samples x samples rays a pixel for colour, averaged in linear light; 0 leaves colour unwritten. All
+        samples: samples x samples rays per pixel for colour, averaged in linear light; 0 leaves colour unwritten. All
             the rest is of the ray through the pixel's centre.
     """
     height, width = frame.depth.shape[2:]

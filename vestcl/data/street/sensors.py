@@ -18,8 +18,8 @@ FARTHEST: Final = 120.0
 RANGE_STD: Final = 0.02
 BEAMS: Final = (64, 32, 16)
 
-#: Degrees from return to return at 10 revolutions a second (the same data sheet), but no fewer pixels than that: a scan
-#: is sparse at any size of the image.
+#: Degrees from return to return at 10 revolutions per second (the same data sheet), but no fewer pixels than that: a
+#: scan is sparse at any size of the image.
 AZIMUTH_STEP: Final = 0.1728
 LEAST_PIXELS: Final = 2.0
 
@@ -95,7 +95,7 @@ class DisturbedLabels:
 
 
 def _grown(region: NDArray[np.bool_], pixels: float) -> NDArray[np.bool_]:
-    """The region dilated by so many pixels, or eroded by as many below 0."""
+    """The region dilated by this many pixels, or eroded by as many below 0."""
     size = 2 * round(abs(pixels)) + 1
     if size == 1:
         return region

@@ -62,7 +62,7 @@ class Street:
 
         Args:
             seed: a non-negative integer.
-            trajectory: [N,4,4] world_from_cam of a real drive in metres, 10 frames a second, N of 2 or more: the
+            trajectory: [N,4,4] world_from_cam of a real drive in metres, 10 frames per second, N of 2 or more: the
                 camera takes over its speed and its sideways, vertical, yaw, pitch and roll wobble, but not its turns,
                 see `Recording.from_trajectory`. Beyond its end it is played backwards, then forwards again. Without
                 it, `Sway`.
@@ -124,16 +124,16 @@ class Street:
             height: of the images in pixels.
             width: of the images in pixels.
             t: seconds, one for all or [B].
-            samples: colour is the mean over samples x samples evenly spaced rays a pixel, taken in linear light as a
+            samples: colour is the mean over samples x samples evenly spaced rays per pixel, taken in linear light as a
                 sensor sums it, before the display's curve. All the rest is of the ray through the pixel's centre.
             foreground: False leaves out cars, people and poles (SPEC section 3.2) and their shadows.
-            instances: whether the frame tells which moving car or person each pixel shows.
+            instances: whether the frame shows which moving car or person each pixel shows.
 
         Returns:
             A `Frame` of B images.
 
         Raises:
-            ValueError: an argument has the wrong shape or a value that is no camera; the message names it.
+            ValueError: an argument has the wrong shape or a value that is not a camera; the message names it.
         """
         poses, cameras, times = check_cameras(camera_from_world, K, height, width, t)
         check_samples(samples)
@@ -155,7 +155,7 @@ class Street:
         """How what each pixel shows moves: u = x_next - x_cur, x_next = next_from_world (world_from_cur x_cur + d).
 
         x_cur is the point that the ray through the pixel's centre meets at ``t_cur``, in that camera's frame; d, in the
-        world, is how far its car or person gets until ``t_next``, 0 for what stands still. The sky, SKY_DEPTH away,
+        world, is how far its car or person gets until ``t_next``, 0 for what is static. The sky, SKY_DEPTH away,
         only turns: u = R x_cur - x_cur.
 
         Args:
@@ -171,7 +171,7 @@ class Street:
             displacement_xyz [3,H,W], metres.
 
         Raises:
-            ValueError: an argument has the wrong shape or a value that is no camera; the message names it.
+            ValueError: an argument has the wrong shape or a value that is not a camera; the message names it.
         """
         cur, after = check_pose("cur_from_world", cur_from_world), check_pose("next_from_world", next_from_world)
         _, cameras, times = check_cameras(np.stack([cur, after]), K, height, width, [t_cur, t_next])

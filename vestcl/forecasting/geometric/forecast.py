@@ -61,16 +61,16 @@ def forecast_clip(
     """
     done, total = [0.0], _stages(index, memory) + steps * len(views)
 
-    def tell(stage: str) -> None:
+    def report(stage: str) -> None:
         if progress:
             progress(stage, min(done[0] / total, 1.0))
         done[0] += 1
 
-    return forecast_frames(Perception(clip, tell, inpaint=inpaint), index, steps, views, memory=memory, tell=tell)
+    return forecast_frames(Perception(clip, report, inpaint=inpaint), index, steps, views, memory=memory, report=report)
 
 
 def _stages(index: int, memory: int) -> int:
-    """Results that a forecast asks `Perception` for: six of each frame, and the picture before them."""
+    """Results that a forecast asks `Perception` for: six of each frame, and the image before them."""
     return 6 * min(index + 1, 2 + max(memory, 0)) + 1
 
 
@@ -83,7 +83,7 @@ def forecast_frames(
     future_from_cur: Sequence[NDArray[np.float64]] | None = None,
     paths: Paths | None = None,
     memory: int = MEMORY,
-    tell: Callable[[str], None] = lambda stage: None,
+    report: Callable[[str], None] = lambda stage: None,
 ) -> Forecast:
     """`forecast_clip` on a `Perception` that may have seen earlier frames already, and keeps what it sees.
 
@@ -95,7 +95,7 @@ def forecast_frames(
         future_from_cur: [4, 4] m per step, the camera's motion from t, in place of the forecast one.
         paths: of the points of frame t; None is `point_paths`.
         memory: frames before t-1 whose static scene is shown where t and t-1 leave something open, 0 or more.
-        tell: called with the stage before each view.
+        report: called with the stage before each view.
 
     Raises:
         ValueError: as `forecast_clip`.
@@ -115,7 +115,7 @@ def forecast_frames(
         moved = [cloud(step, _by_step(cameras)) for cloud in clouds]
         frames.append({})
         for view in views:
-            tell("render")
+            report("render")
             frames[-1][view.name] = render_clouds(moved, clip[index].K if view.K is None else view.K, view, *size)
     seconds = perception.seconds | {"render": time.perf_counter() - start}
     return Forecast(METHOD, cameras[:steps], frames, seconds, notes=input_notes(perception, index))
@@ -137,7 +137,7 @@ def gap_notes(perception: Perception, index: int) -> tuple[str, ...]:
     clip = perception.clip
     gap = clip.elapsed(index) * (clip.interval or 1.0)
     names = f"{clip[index - 1].name} and {clip[index].name}"
-    return (f"frames {names} are {gap:.3g} s apart, too far to be matched: motion goes on as before the gap",)
+    return (f"frames {names} are {gap:.3g} s apart, too far to be matched: motion continues as before the gap",)
 
 
 def show_frame(
@@ -292,7 +292,7 @@ def render_clouds(
         width: px.
 
     The inpainted background is a guess, and only wanted where the foreground has moved away: cracks, and what enters
-    the picture from outside, are better guessed from beside. On kitti_clip's traffic that is worth 3 dB.
+    the image from outside, are better guessed from the side. On kitti_clip's traffic that is worth 3 dB.
     """
     seen_from = K, view.tgt_from_next, height, width
     shown = show(list(clouds[:2]), *seen_from)

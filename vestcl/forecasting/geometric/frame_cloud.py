@@ -16,7 +16,7 @@ class FrameCloud:
     points_xyz: NDArray[np.float32]
     """[N, 3] m, in the source camera's frame at that time."""
     z_src: NDArray[np.float32]
-    """[N] m, depth in the picture that the points come from."""
+    """[N] m, depth in the image that the points come from."""
     image: NDArray[np.float32]
     """[3, H, W] RGB, the image that the points come from."""
     step_xyz: NDArray[np.float32]
@@ -70,8 +70,8 @@ class CloudPixels:
         """[*] as [N], the opposite of `laid_out`."""
         return values.ravel() if not self.dense or self.all else values.ravel()[self.flat]
 
-    def beside(self, planes: NDArray[np.float32]) -> Callable[[int, int], NDArray[np.float32]]:
-        """Values of ``planes`` [C, *] so many rows below and columns to the right, up to one: [C, *], NaN if none."""
+    def neighbours(self, planes: NDArray[np.float32]) -> Callable[[int, int], NDArray[np.float32]]:
+        """Values of ``planes`` [C, *] this many rows below and columns to the right, up to one: [C, *], NaN if none."""
         grid = np.full((len(planes), self.height + 2, self.width + 2), np.nan, np.float32)
         if self.dense:
             grid[:, 1:-1, 1:-1] = planes
@@ -83,7 +83,7 @@ class CloudPixels:
 
 
 def transposed(matrix: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The transpose in memory of its own, as NumPy copies it, in a third of the time."""
+    """The transpose in its own memory, as NumPy copies it, in a third of the time."""
     if not matrix.size:
         return np.zeros(matrix.shape[::-1], np.float32)
     return np.asarray(cv2.transpose(matrix), np.float32).reshape(matrix.shape[::-1])

@@ -37,9 +37,9 @@ _JUMP: Final = 1.3
 _AGREE: Final = 0.1
 
 #: Colours in [0, 1] are of one surface if their mean difference is no larger.
-_ALIKE: Final = 0.1
+_SIMILAR: Final = 0.1
 
-#: A frame is remembered if so large a share of what t shows as well agrees with it, of so many points or more.
+#: A frame is remembered if so large a share of what t shows as well agrees with it, of this many points or more.
 _TRUSTED, _FEWEST = 0.5, 100
 
 #: A camera that drives on sees what is that much beyond the image's sides, as a factor of its width and height; what
@@ -220,7 +220,7 @@ def _aligned(frame: _Kept, cur_from_src: Matrix, cur: Surface, K: Matrix) -> tup
     scale = float(np.median((depth - ahead)[near] / np.maximum(z - ahead, _NEAREST)[near]))
     curve = tone_curve(values[:, near], wanted[:, near])
     off = np.abs(np.log(depth / np.maximum(ahead + scale * (z - ahead), _NEAREST)))
-    agree = (off < np.log1p(_AGREE)) & (np.abs(curve(values) - wanted).mean(0) < _ALIKE)
+    agree = (off < np.log1p(_AGREE)) & (np.abs(curve(values) - wanted).mean(0) < _SIMILAR)
     if agree.mean() < _TRUSTED:
         return None
     return curve(frame.image), np.where(solid, np.float32(scale) * frame.depth, frame.depth)

@@ -13,14 +13,15 @@ from vestcl.scene.motion import backtest
 from vestcl.scene.motion.camera_forecast import forecast_camera
 from vestcl.scene.perception import Perception
 
-#: The camera is forecast from so many last motions. On KITTI odometry 00 four have 0.66 of constant velocity's error of
-#: rotation at t+1 and 0.77 of that of translation, all that were before 0.65 and 0.72; each takes a flow and a depth.
+#: The camera is forecast from this many of the last motions. On KITTI odometry 00 four have 0.66 of constant velocity's
+#: error of rotation at t+1 and 0.77 of that of translation, all that were before 0.65 and 0.72; each takes a flow and a
+#: depth.
 _MOTIONS: Final = 4
 
 #: Seconds between frames of a clip without times: KITTI's.
 _INTERVAL: Final = 0.1
 
-#: Candidates are tested over one frame, and over two, which tell apart what goes on and what stops.
+#: Candidates are tested over one frame, and over two, which distinguish what continues from what stops.
 _TESTED: Final = (1, 2)
 
 
@@ -76,7 +77,7 @@ def _tested_paths(perception: Perception, index: int) -> Paths:
         errors.append(backtest.backtest(positions, before, perception.image(index), flows))
     if index == 1:
         errors = [backtest.untested(perception.frame(index), by_flow)]
-    objects = perception.moving(index).things
+    objects = perception.moving(index).instances
     held = [backtest.held_together(each, objects) for each in backtest.by_step(errors, by_flow)]
     return Paths(perception.frame(index), tuple(held), by_flow)
 

@@ -75,7 +75,9 @@ def show(
     uncovered = np.ones(len(wanted), np.float32)
     for cloud in clouds:
         through = left > 0
-        pixels = _Wanted(height, width, None if where is None else wanted, None if through.all() else wanted[through])
+        pixels = _Requested(
+            height, width, None if where is None else wanted, None if through.all() else wanted[through]
+        )
         mean, coverage = _splat(cloud, K, tgt_from_next, pixels)
         opacity = np.minimum(coverage / np.float32(_OPAQUE), 1) * (coverage > HOLE)
         if pixels.coloured is None:
@@ -95,7 +97,7 @@ def show(
 
 
 @dataclass(frozen=True, eq=False)
-class _Wanted:
+class _Requested:
     """The pixels of a view that are wanted, flat."""
 
     height: int
@@ -111,7 +113,7 @@ class _Wanted:
 
 
 def _splat(
-    cloud: FrameCloud, K: NDArray[np.float64], tgt_from_next: NDArray[np.float64], wanted: _Wanted
+    cloud: FrameCloud, K: NDArray[np.float64], tgt_from_next: NDArray[np.float64], wanted: _Requested
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """image [7, L], divided by coverage, and coverage [M]."""
     still = np.zeros((1, *cloud.points_xyz.shape), np.float32)
@@ -148,7 +150,7 @@ def _features(
 
 
 def _near(
-    cloud: FrameCloud, points_uv: NDArray[np.float32], pixels: NDArray[np.intp], view: _Wanted
+    cloud: FrameCloud, points_uv: NDArray[np.float32], pixels: NDArray[np.intp], view: _Requested
 ) -> NDArray[np.bool_]:
     """[N], True where a point may be seen in one of the ``pixels`` [M] of a view, flat, or where such a point needs it.
 

@@ -53,7 +53,7 @@ MARGIN: Final = 0.02
 #: Squared errors beyond are of something else, as in `vestcl.scene.motion.backtest`.
 MOST: Final = 0.05
 
-#: The grid has about so many pixels, whatever the image's size.
+#: The grid has about this many pixels, whatever the image's size.
 _PIXELS: Final = 60_000
 
 #: Fewer pixels than that are no test.
@@ -151,7 +151,7 @@ def _present(model: Forecaster) -> list[str]:
 
 
 def _untestable(perception: Perception, index: int) -> str | None:
-    """Why frame ``index`` is no test; None where it is one."""
+    """Why frame ``index`` is not a test; None where it is one."""
     if index < 2:
         return "there are too few frames before to test it on"
     if perception.is_lost(index) or perception.is_lost(index - 1):

@@ -25,7 +25,7 @@ from vestcl.scene.perception import Perception
 
 Progress = Callable[[str, float], None]
 
-#: Stages of a forecast that `Perception` tells of: results for two frames, and the picture before them.
+#: Stages of a forecast that `Perception` reports: results for two frames, and the image before them.
 _STAGES = 13
 
 
@@ -65,13 +65,13 @@ def forecast_clip(
     composed = _is_composed(model.config, mode, learned)
     done, total = [0], _STAGES + (steps * len(views) if composed else 0)
 
-    def tell(stage: str) -> None:
+    def report(stage: str) -> None:
         if progress:
             progress(stage, min(done[0] / total, 1.0))
         done[0] += 1
 
-    how: dict[str, Any] = {"mode": mode, "perceive": perceive, "learned": learned, "tell": tell}
-    return forecast_frames(Perception(clip, tell, inpaint=inpaint), model, index, steps, views, **how)
+    how: dict[str, Any] = {"mode": mode, "perceive": perceive, "learned": learned, "report": report}
+    return forecast_frames(Perception(clip, report, inpaint=inpaint), model, index, steps, views, **how)
 
 
 def forecast_frames(
@@ -84,7 +84,7 @@ def forecast_frames(
     mode: Mode | None = None,
     perceive: Perceive | None = None,
     learned: Learned = "tested",
-    tell: Callable[[str], None] = lambda stage: None,
+    report: Callable[[str], None] = lambda stage: None,
 ) -> Forecast:
     """`forecast_clip` on a `Perception` that may have seen earlier frames already, and keeps what it sees.
 
@@ -102,7 +102,7 @@ def forecast_frames(
         mode: see `forecast_clip`.
         perceive: see `forecast_clip`.
         learned: "all" is the network's own forecast, as `Forecaster.forecast` has it, without a test.
-        tell: called with the stage before the networks run.
+        report: called with the stage before the networks run.
 
     Raises:
         ValueError: as `forecast_clip`.
@@ -115,9 +115,9 @@ def forecast_frames(
     if learned not in get_args(Learned):
         raise ValueError(f'`learned` must be "tested" or "all", got {learned!r}')
     if _is_composed(model.config, mode, learned):
-        return _composed(perception, model, index, steps, views, tell)
+        return _composed(perception, model, index, steps, views, report)
     given, note = _given(perception, index, model.config, steps)
-    tell("network")
+    report("network")
     start = time.perf_counter()
     with torch.inference_mode(), watching() as watch, count_skips() as tally:
         done = model.forecast(
@@ -148,14 +148,14 @@ def _composed(
     index: int,
     steps: int,
     views: Sequence[View],
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> Forecast:
     """The geometric forecast with the learned parts that pass the test."""
     note = interval_note(perception.clip, index, model.config)
     known = note is None and interval_note(perception.clip, max(index - 1, 1), model.config) is None
     paths = point_paths(perception, index)
     perception.seen(index - 1)
-    tell("network")
+    report("network")
     clock = _Clock(perception)
     with torch.inference_mode(), watching() as watch, count_skips() as tally:
         with clock:
@@ -163,7 +163,7 @@ def _composed(
             motion = chosen_motion(perception, model, index, steps, parts)
         moved = CorrectedPaths(paths.frame, paths.errors, paths.by_flow, motion.velocity_cur if motion.moves else None)
         geometric = forecast_geometric(
-            perception, index, steps, views, future_from_cur=motion.cameras, paths=moved, tell=tell
+            perception, index, steps, views, future_from_cur=motion.cameras, paths=moved, report=report
         )
         frames = geometric.frames
         if REFINEMENT in parts and parts[REFINEMENT].used:

@@ -19,7 +19,7 @@ from vestcl.scene.motion.camera_forecast import forecast_camera
 from vestcl.scene.motion.ego_motion import constant_velocity
 from vestcl.scene.perceived import PerceivedFrame
 
-#: So many last motions count in a path, as in the geometric forecast.
+#: This many of the last motions count in a path, as in the geometric forecast.
 PAST: Final = MEASURED
 
 
@@ -65,11 +65,11 @@ def network_input(
         cur: the frame at t, of the same size and camera.
         motions: ``cur_from_prev`` [4, 4] m of the last consecutive frames, oldest first; the last one is from ``prev``
             to ``cur``, over ``cur.elapsed`` intervals, the one before over ``prev.elapsed``, others over one. One or
-            two are usual, see `last_motions`.
+            two is the default, see `last_motions`.
         path: the camera's forecast motion, from `camera_path`; None is constant velocity.
 
     Returns:
-        The input with B = 1; tensors of their own memory.
+        The input with B = 1; tensors with their own memory.
 
     Raises:
         ValueError: frames of different sizes or cameras, no motion, or a matrix that is not finite.
@@ -166,7 +166,7 @@ def as_motion(dst_from_src: NDArray[np.float64]) -> RigidMotion:
 
 
 def _velocity(frame: PerceivedFrame, next_from_src: NDArray[np.float64], intervals: float) -> NDArray[np.float32]:
-    """[3, H, W] m per interval: the frame's, but the recording car stays where it is in the picture."""
+    """[3, H, W] m per interval: the frame's, but the recording car stays where it is in the image."""
     if not frame.own.any():
         return np.array(frame.velocity, np.float32)
     y, x = np.nonzero(frame.own[0])

@@ -67,7 +67,7 @@ class Video:
         """
         if not -self.frames <= index < self.frames:
             raise IndexError(f"{self.path}: has frames 0 ... {self.frames - 1}, not {index}")
-        if self._pid != os.getpid():  # forked: the parent goes on reading through what it has open
+        if self._pid != os.getpid():  # forked: the parent continues reading through what it has open
             self._open()
         with self._lock:
             decoded = self._decoder.frame(index % self.frames).to_ndarray(format="rgb24", threads=1)  # none to fork

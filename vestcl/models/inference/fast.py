@@ -61,7 +61,7 @@ def accelerate(model: Forecaster, precision: Precision = "float32") -> "FastFore
 
 
 def computes_bfloat16() -> bool:
-    """Whether this processor has instructions for bfloat16; False where torch does not tell."""
+    """Whether this processor has instructions for bfloat16; False where torch does not report it."""
     capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     return any(capabilities.get(name, False) for name in _BFLOAT16)
 
@@ -162,7 +162,7 @@ def share_frames(network: ObjectMotion, blocks: int | None = None) -> bool:
 
     Args:
         network: object motion of shape "dmvfn" without routing. Its weights may change at any time.
-        blocks: the first so many share, as more are not going to run (see `InferenceOptions.blocks`); None is all.
+        blocks: the first this many share, as more are not going to run (see `InferenceOptions.blocks`); None is all.
 
     Returns:
         Whether they do. Others stay as they are: blocks that routing leaves out would be computed after all, and at the

@@ -45,7 +45,7 @@ class InferenceOptions:
     splat_scale: float = 1.0
     """Clouds are splatted at this fraction of the view's height and width, and the planes enlarged."""
     blocks: int | None = None
-    """Only the first so many blocks of object motion run, from coarse to fine; None is all of them, 0 none."""
+    """Only the first this many blocks of object motion run, from coarse to fine; None is all of them, 0 none."""
     paint_scale: float = 1.0
     """Refinement's correction of the splatted colour is computed at this fraction of the view's height and width, and
     enlarged. A network that predicts RGB directly (`RefineConfig.base` "none") has no such correction: only 1."""

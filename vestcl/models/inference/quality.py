@@ -1,9 +1,9 @@
 """How good a forecast by a network has to be: three points on the curve of run time against error.
 
     exact      float32; skips what changes nothing but rounding
-    balanced   the knees that cost at most 0.1 dB of PSNR: what was measured to stand stands, two blocks correct the
+    balanced   the knees that cost at most 0.1 dB of PSNR: what was measured as static is static, two blocks correct the
                motion of what does not, details are refined at half the size
-    fast       beyond them: details at a quarter of it, things move as they were measured to
+    fast       beyond them: details at a quarter of it, objects move as they were measured to
 
 `vestcl bench pareto` measures the curve; docs/time_against_error has it, and the points chosen.
 """
@@ -49,7 +49,7 @@ def settings(quality: Quality) -> InferenceOptions:
 
 
 def about(quality: Quality) -> dict[str, Any]:
-    """What a file tells of it: {"quality": ..., "skip": {...}, "effort": {...}, "autocast": name or None}.
+    """What a file contains of it: {"quality": ..., "skip": {...}, "effort": {...}, "autocast": name or None}.
 
     Raises:
         ValueError: another word.
@@ -60,8 +60,8 @@ def about(quality: Quality) -> dict[str, Any]:
 def apply(model: Forecaster, quality: Quality) -> Forecaster:
     """Let ``model`` forecast at ``quality`` from now on; its weights stay as they are.
 
-    bfloat16 is for processors that compute in it: elsewhere it costs time, and float32 stays. Where the network paints
-    anew (`RefineConfig.base` "none"), refinement stays at full size.
+    bfloat16 is for processors that compute in it: elsewhere it costs time, and float32 stays. Where the network
+    predicts RGB directly (`RefineConfig.base` "none"), refinement stays at full size.
 
     Args:
         model: a trained network.

@@ -7,12 +7,12 @@ from torch.nn import functional
 
 
 def fraction(height: int, width: int, scale: float) -> tuple[int, int]:
-    """ceil(scale H), ceil(scale W): the size in pixels of ``scale`` of a picture."""
+    """ceil(scale H), ceil(scale W): the size in pixels of ``scale`` of an image."""
     return math.ceil(scale * height), math.ceil(scale * width)
 
 
 def reduced(image: torch.Tensor, height: int, width: int) -> torch.Tensor:
-    """Means over cells of a grid that covers the picture, cells' edges at whole pixels.
+    """Means over cells of a grid that covers the image, cells' edges at whole pixels.
 
     Args:
         image: [B, C, H, W].

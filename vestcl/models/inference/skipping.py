@@ -10,10 +10,10 @@ import cv2
 import torch
 from torch.nn import functional
 
-#: Two boxes become one if that adds fewer pixels: a pass through a network costs about as much as so many of them.
+#: Two boxes become one if that adds fewer pixels: a pass through a network costs about as much as this many of them.
 _PASS: Final = 16384
 
-#: From this share of a picture on boxes are not worth while.
+#: From this share of an image on boxes are not worth while.
 _WHOLE: Final = 0.6
 
 
@@ -98,12 +98,12 @@ def boxes(wanted: torch.Tensor, margin: int, align: int) -> list[Box]:
     """Boxes that together hold all of ``wanted`` with ``margin`` around it; they don't touch.
 
     Regions of cells that touch get a box each; boxes that touch, or that one pass is cheaper for, become one; boxes
-    that hold most of the picture become all of it.
+    that hold most of the image become all of it.
 
     Args:
         wanted: bool [H, W].
-        margin: px, cut off at the picture's edges.
-        align: px, a cell's side; edges are multiples of it, or the picture's.
+        margin: px, cut off at the image's edges.
+        align: px, a cell's side; edges are multiples of it, or the image's.
 
     Returns:
         By their left edges; none where nothing is wanted.

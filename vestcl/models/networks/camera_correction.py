@@ -37,7 +37,7 @@ NUMBERS: Final = 6
 #: Rates of rotation, rad/s, and velocities, m/s, are shown to the network times that.
 _SHOWN: Final = (10.0, 0.1)
 
-#: m/s from which on a correction counts in full: a car that stands does not turn or sway, and half of what little is
+#: m/s from which on a correction counts in full: a static car does not turn or sway, and half of what little is
 #: measured of it is noise.
 _ROLLING: Final = 5.0
 

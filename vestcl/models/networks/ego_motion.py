@@ -29,7 +29,7 @@ _TURN_SHOWN: Final = 100.0
 #: so that Adam's first steps, all of one size, are small ones of motion.
 _TURN_SAID, _SHIFT_SAID = 0.03, 0.1
 
-#: Metres an interval from which on a correction counts in full: a car that stands does not turn or sway, and half of
+#: Metres an interval from which on a correction counts in full: a static car does not turn or sway, and half of
 #: what little is measured of it is noise.
 _ROLLING: Final = 0.5
 

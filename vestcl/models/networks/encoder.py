@@ -102,7 +102,7 @@ class ResidualBlock(nn.Module):
 
 
 class Chain(nn.Sequential):
-    """Modules one after the other, told how to normalise."""
+    """Modules one after the other, given how to normalise."""
 
     def forward(self, x: torch.Tensor, norm: Normalise = own) -> torch.Tensor:
         """x through all of them."""

@@ -20,8 +20,8 @@ class NotedStatistics:
     """Mean and 1 / standard deviation of each GroupNorm, in the order of use.
 
     `note` normalises as GroupNorm does, and keeps what it found. `borrowed` gives a second pass through the same layers
-    that normalises by it, whatever part of the picture it sees: so an encoder's features of a crop equal those of the
-    whole picture. No gradient flows through what is borrowed.
+    that normalises by it, whatever part of the image it sees: so an encoder's features of a crop equal those of the
+    whole image. No gradient flows through what is borrowed.
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class NotedStatistics:
         return y.to(dtype)
 
     def borrowed(self, rows: Sequence[int] | torch.Tensor) -> Normalise:
-        """A pass over as many pictures as ``rows``, picture i by the statistics of the noted picture rows[i]."""
+        """A skip as many images as ``rows``, image i by the statistics of the noted image rows[i]."""
         noted = iter(self._noted)
 
         def normalise(norm: nn.GroupNorm, x: torch.Tensor) -> torch.Tensor:

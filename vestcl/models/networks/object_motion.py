@@ -85,7 +85,7 @@ class ObjectMotion(nn.Module):
             mask_prev: [B, 1, H, W], 1 on the static background.
             mask_cur: the same at t.
             flow0: [B, 6, H, W] m, the rigid flow of both frames' pixels to t + 1.
-            blocks: only the first so many run, of those that routing chooses; None is all.
+            blocks: only the first this many run, of those that routing chooses; None is all.
             backgrounds: with ``inpainted`` features [B, features, H, W] of the background at t - 1 and at t, and its
                 depth [B, 1, H, W] m at t - 1 and at t.
 

@@ -138,7 +138,7 @@ def fill(image: torch.Tensor, opacity: torch.Tensor) -> torch.Tensor:
         opacity: a [B, 1, H, W] in [0, 1].
 
     Returns:
-        [B, C, H, W], opaque; black where there is nothing in the whole picture. Differentiable.
+        [B, C, H, W], opaque; black where there is nothing in the whole image. Differentiable.
 
     Source: Gortler et al., The Lumigraph, 1996.
     """

@@ -17,7 +17,7 @@ from vestcl.ops.unproject import unproject
 
 
 class PixelGrid(NamedTuple):
-    """The points start ... start + height width - 1 are a picture's pixels, row after row."""
+    """The points start ... start + height width - 1 are an image's pixels, row after row."""
 
     start: int
     height: int
@@ -32,9 +32,9 @@ class Cloud(NamedTuple):
     displacement_xyz: torch.Tensor
     """[P, 3] m: x + u is in the camera of t+k."""
     step_xyz: torch.Tensor
-    """[P, 3] m: what moved beside the camera over one frame interval, in the camera of t+k."""
+    """[P, 3] m: what moved relative to the world over one frame interval, in the camera of t+k."""
     depth: torch.Tensor
-    """[P] m, of the frame that they come from, and so the size of what a point stands for."""
+    """[P] m, of the frame that they come from, and so the size of what a point represents."""
     features: torch.Tensor
     """[P, C]."""
     colour: torch.Tensor
@@ -192,10 +192,10 @@ def in_plane(points_xyz: torch.Tensor, displacement_xyz: torch.Tensor) -> torch.
 def advance(cloud: Cloud, next_from_cur: torch.Tensor, flat: bool = False) -> Cloud:
     """One frame interval on: x_(k+1) = G x_k + R s_k and s_(k+1) = R s_k, with G = (R, t) = ``next_from_cur``.
 
-    The camera repeats its motion G [B, 4, 4], and what has moved beside it moves on at its velocity s in the world.
-    What is fixed to the camera, x_1 = x, stays there while R = I. In a bend that is no constant velocity, and it drifts
-    by (R - I) (x - G x) in the second step: the recording car's own bonnet at 1 m and 0.01 rad a frame by 1 cm.
-    With ``flat`` motion is a 2D flow, see `in_plane`.
+    The camera repeats its motion G [B, 4, 4], and what moves in the world continues at its velocity s there.
+    What is fixed to the camera, x_1 = x, stays there while R = I. In a bend that is not a constant velocity, and it
+    drifts by (R - I) (x - G x) in the second step: the recording car's own bonnet at 1 m and 0.01 rad per frame by 1
+    cm. With ``flat`` motion is a 2D flow, see `in_plane`.
     """
     points = cloud.points_xyz + cloud.displacement_xyz
     turned = _per_image(cloud.step_xyz, _rotation(next_from_cur), cloud.sizes)

@@ -22,7 +22,7 @@ def encode(
         config: of it; says what a background is normalised by.
         layers: of B frames.
         options: with ``background`` the background is encoded where it has to be.
-        tally: is told how much that left out.
+        tally: is passed how much that left out.
     """
     if config.background == "own":
         own, background = _apart(encoder, layers, tally)

@@ -15,7 +15,7 @@ _REMEMBERED: Final = 2
 #: Frames that are kept for all threads together, those that ended, too: at 256 x 832 a frame takes some 30 MB.
 _MOST: Final = 8
 
-#: Every so many rows and columns are compared before all are: of two frames a few pixels already differ.
+#: Every this many rows and columns are compared before all are: of two frames a few pixels already differ.
 _SOME: Final = 16
 
 
@@ -108,16 +108,16 @@ def _copies(tensors: Iterable[torch.Tensor]) -> list[torch.Tensor]:
     return [tensor.detach().clone() for tensor in tensors]
 
 
-def _alike(one: torch.Tensor, other: torch.Tensor) -> bool:
+def _similar(one: torch.Tensor, other: torch.Tensor) -> bool:
     return one.dtype == other.dtype and one.device == other.device and one.shape == other.shape
 
 
 def _same_weights(one: torch.Tensor, other: torch.Tensor) -> bool:
-    return _alike(one, other) and torch.equal(one, other)
+    return _similar(one, other) and torch.equal(one, other)
 
 
 def _same(one: torch.Tensor, other: torch.Tensor) -> bool:
-    if not _alike(one, other):
+    if not _similar(one, other):
         return False
     some = one[..., ::_SOME, ::_SOME], other[..., ::_SOME, ::_SOME]
     return torch.equal(*some) and torch.equal(one, other)

@@ -29,7 +29,7 @@ class Motion(NamedTuple):
     flow0: torch.Tensor
     """[B, 6, H, W] m: the rigid flow of the previous frame's pixels, then of the current one's."""
     start: torch.Tensor
-    """[B, 6, H, W] m: what object motion starts from: ``flow0``, and what the prior says of things beside it."""
+    """[B, 6, H, W] m: what object motion starts from: ``flow0``, and the prior's object motion in addition to it."""
     objects: ObjectMotionForecast
     """The flow that is used, each block's candidates, which ran, their probabilities; without object motion the flow
     is ``flow0`` and L = 0."""
@@ -107,7 +107,7 @@ def arrived(
         prev: frame at t - 1.
         cur: frame at t.
         K: [B, 3, 3] px.
-        to_next: the camera's motion, or a prior, of which what moves beside the camera comes along, too.
+        to_next: the camera's motion, or a prior, of which what moves by itself comes along, too.
         flat: motion is a 2D flow, see `in_plane`.
     """
     if isinstance(to_next, MotionPrior):
@@ -123,8 +123,8 @@ def arrived(
     if isinstance(to_next, MotionPrior):
         turn = geometry.quaternion_to_matrix(cur_from_prev.quaternion)
         elapsed = to_next.span - 1
-        beside = elapsed * torch.einsum("bij,bjhw->bihw", turn, to_next.velocity_prev)
-        flow = flow0 + torch.cat([beside, torch.zeros_like(beside)], dim=1)
+        residual = elapsed * torch.einsum("bij,bjhw->bihw", turn, to_next.velocity_prev)
+        flow = flow0 + torch.cat([residual, torch.zeros_like(residual)], dim=1)
     if flat:
         flow0, flow = flattened(points, flow0), flattened(points, flow)
     objects = ObjectMotionForecast(flow, [], torch.zeros(len(flow), 0, dtype=torch.bool), None)

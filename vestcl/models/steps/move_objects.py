@@ -17,10 +17,10 @@ from vestcl.models.steps.frames import FOREGROUND_BELOW, EncodedFrame
 #: From t - 1 and from t to t + 1; OMF runs at the interval that it learned at, of evenly spaced frames.
 _INTERVALS: Final = (2, 1)
 
-#: What is slower, metres an interval, stands: at 10 Hz half of a brisk walk ...
+#: What is slower, metres per interval, stands: at 10 Hz half of a brisk walk ...
 SLOWEST: Final = 0.08
 
-#: ... in the mean over cells of so many pixels a side.
+#: ... in the mean over cells of this many pixels per side.
 _CELL: Final = 32
 
 
@@ -53,7 +53,7 @@ def move_objects(
         start: what OMF corrects.
         options: with ``objects``, OMF runs around the foreground, if it is to move nothing else; with ``still`` around
             dynamic objects only; ``blocks`` is how many blocks run, None is all.
-        tally: is told how much that left out.
+        tally: is passed how much that left out.
     """
     if options.blocks == 0:
         return unmoved(start)
@@ -96,7 +96,7 @@ def _planes(prev: EncodedFrame, cur: EncodedFrame, inpainted: bool) -> tuple[lis
 
 
 class _Piece(NamedTuple):
-    """Of the picture: what OMF is not shown of it, and what it may change."""
+    """Of the image: what OMF is not shown of it, and what it may change."""
 
     box: Box
     beyond: torch.Tensor
@@ -123,11 +123,11 @@ def _whole(start: torch.Tensor, pieces: Iterable[_Piece], parts: Iterable[torch.
     return flow
 
 
-def _rolling(foreground: torch.Tensor, beside: torch.Tensor) -> torch.Tensor:
-    """bool [B, 2, H, W]: where what is ``foreground`` [B, 2, H, W] moves by SLOWEST an interval or more beside the
-    camera, ``beside`` [B, 6, H, W] m, in the mean over cells: some pixels of a parked car always seem to."""
+def _rolling(foreground: torch.Tensor, residual: torch.Tensor) -> torch.Tensor:
+    """bool [B, 2, H, W]: where what is ``foreground`` [B, 2, H, W] moves by SLOWEST per interval or more in addition to
+    the rigid flow, ``residual`` [B, 6, H, W] m, in the mean over cells: some pixels of a parked car always seem to."""
     height, width = foreground.shape[2:]
-    metres = beside.unflatten(1, (2, 3)).square().sum(dim=2).sqrt() / beside.new_tensor(_INTERVALS)[:, None, None]
+    metres = residual.unflatten(1, (2, 3)).square().sum(dim=2).sqrt() / residual.new_tensor(_INTERVALS)[:, None, None]
     share, moved = (
         functional.avg_pool2d(plane, _CELL, ceil_mode=True)
         for plane in (foreground.to(metres), torch.where(foreground, metres, 0))
@@ -137,7 +137,7 @@ def _rolling(foreground: torch.Tensor, beside: torch.Tensor) -> torch.Tensor:
 
 
 def _where(network: ObjectMotion, moving: torch.Tensor, options: InferenceOptions, tally: Tally) -> list[Box]:
-    """The parts of the picture that OMF is to see; one alone where it chooses its blocks by the whole scene."""
+    """The parts of the image that OMF is to see; one alone where it chooses its blocks by the whole scene."""
     batch, _, height, width = moving.shape
     whole = Box(0, height, 0, width)
     if network.config.where == "everywhere" or not options.objects:

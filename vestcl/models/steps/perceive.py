@@ -120,7 +120,7 @@ def _filled(depth: NDArray[Any]) -> NDArray[Any]:
     depth = _unmixed(depth)
     known = depth[0] > 0
     if not known.any():
-        raise ValueError("`depth` must be known (above 0 m) somewhere: no point of the forecast is in the picture")
+        raise ValueError("`depth` must be known (above 0 m) somewhere: no point of the forecast is in the image")
     _, nearest = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )

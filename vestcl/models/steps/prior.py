@@ -60,7 +60,7 @@ class MotionPrior(NamedTuple):
 
 
 def nothing_moves(like: torch.Tensor) -> MotionPrior:
-    """The prior of frames ``like`` [B, C, H, W] in which neither the camera nor a thing was seen to move."""
+    """The prior of frames ``like`` [B, C, H, W] in which neither the camera nor an object was seen to move."""
     rest, still = RigidMotion.rest(like), like.new_zeros(len(like), 3, *like.shape[2:])
     return MotionPrior(rest, rest, rest, still, still)
 
@@ -99,7 +99,7 @@ def check_prior(prior: MotionPrior, like: torch.Tensor) -> None:
     )
 
 
-def beside(prior: MotionPrior, to_next: Sequence[RigidMotion]) -> torch.Tensor:
+def residual_flow(prior: MotionPrior, to_next: Sequence[RigidMotion]) -> torch.Tensor:
     """n R v [B, 6, H, W] m: what the velocities v add to the rigid flow over n = `MotionPrior.intervals` and n = 1."""
     moved = []
     velocities, spans = (prior.velocity_prev, prior.velocity_cur), (prior.span, 1)
@@ -118,14 +118,14 @@ def repeated(
 ) -> MotionPrior:
     """The prior of the step after: the camera's motion G once more, and what moved next to it as it did.
 
-    What is seen at x came m over the interval, so beside the camera by s = x - G (x - m), whatever the mask says of it:
-    shadows and errors of depth have velocities, too. The frame before has R^-1 of what its pixels moved beside the
-    rigid flow.
+    What is seen at x came m over the interval, so in addition to the camera's motion by s = x - G (x - m), whatever the
+    mask says of it: shadows and errors of depth have velocities, too. The frame before has R^-1 of what its pixels
+    moved in addition to the rigid flow.
 
     Args:
         prior: of the step that is done.
         next_from_cur: G of that step.
-        moved: [B, 3, H, W] m, of its current frame's pixels beside the rigid flow, in the next camera's axes.
+        moved: [B, 3, H, W] m, of its current frame's pixels in addition to the rigid flow, in the next camera's axes.
         seen: its view from the source camera.
         K: [B, 3, 3] px.
 

@@ -20,7 +20,7 @@ from vestcl.scene.inpainting.holes import deep_holes
 from vestcl.shapes import check
 
 #: Metres that inpainted points go farther back in the splatter's order, where they come last: what a frame has not seen
-#: never hides what it has. An inpainted point stands still 1 % behind the object that hides it, and a car that drives
+#: never hides what it has. An inpainted point is static 1 % behind the object that hides it, and a car that drives
 #: ahead of us would soon be behind the road that it was painted over.
 _BEHIND: Final = 4 * SKY_DEPTH
 
@@ -49,7 +49,7 @@ class Side(NamedTuple):
     features: torch.Tensor
     """[B, C, H, W]."""
     known: torch.Tensor
-    """[B, 8, H, W]: what a view tells beside its features; the properties are its parts."""
+    """[B, 8, H, W]: what a view has in addition to its features; the properties are its parts."""
     coverage: torch.Tensor
     """[B, 1, H, W]."""
 
@@ -135,7 +135,7 @@ def splat_cloud(
         width: columns of the view.
         min_transmittance: see `vestcl.splat`.
         open_: bool [B, 1, H, W], the pixels that count: others may be left empty. None is all.
-        tally: is told how many points reach none of them, and are left out; None leaves out none.
+        tally: is passed how many points reach none of them, and are left out; None leaves out none.
         deep: bool [B, 1, H, W], the pixels where inpainted points count, from `inner_holes`; None is all.
         flat: motion is a 2D flow, see `vestcl.models.steps.clouds.in_plane`.
 
@@ -183,7 +183,7 @@ def _sizes(
 def inner_holes(hole: torch.Tensor) -> torch.Tensor:
     """Where foreground moved away from the background: holes [B, 1, H, W] but for cracks and what reaches the border.
 
-    What enters the picture was never hidden by anything: what is beside it is a better guess than what was inpainted.
+    What enters the image was never hidden by anything: what is next to it is a better guess than what was inpainted.
     """
     return torch.from_numpy(np.stack([deep_holes(image) for image in hole.numpy()]))
 
@@ -200,7 +200,7 @@ def _reaching(
 ) -> torch.Tensor:
     """Indices of the points that are not transparent and whose footprints may reach an open pixel.
 
-    From the picture's nearest pixel it is no farther to what is open than from a point outside.
+    From the image's nearest pixel it is no farther to what is open than from a point outside.
 
     Args:
         points_uv: [P, 2] px.
@@ -216,7 +216,7 @@ def _reaching(
 
 
 def _pixels_of(points_uv: torch.Tensor, starts: torch.Tensor, height: int, width: int) -> torch.Tensor:
-    """int32 [P]: index of the pixel of B H W that is nearest to each point [P, 2] px; 0 for what is no number."""
+    """int32 [P]: index of the pixel of B H W that is nearest to each point [P, 2] px; 0 for what is not a number."""
     last = points_uv.new_tensor([width - 1, height - 1])
     column, row = points_uv.nan_to_num(0).minimum(last).clamp_(min=0).to(torch.int32).unbind(1)
     pixel = row * width + column

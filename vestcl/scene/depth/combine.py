@@ -20,7 +20,7 @@ from vestcl.scene.depth.road_plane import fit_road
 from vestcl.scene.flow.correspondence import Correspondence, correspond
 from vestcl.scene.motion.ego_motion import ego_motion
 
-#: Inverse depths that take part in the scale: of a standard deviation below that share of themselves, nearer than so
+#: Inverse depths that take part in the scale: of a standard deviation below that share of themselves, nearer than this
 #: many metres by the network.
 _SURE, _FAR = 0.1, 60.0
 

@@ -1,4 +1,4 @@
-"""Depth for every pixel: what was measured, spread up to the edges of the picture."""
+"""Depth for every pixel: what was measured, spread up to the edges of the image."""
 
 from typing import Final
 

@@ -17,38 +17,38 @@ from vestcl.scene.flow.pose import relative_pose
 from vestcl.scene.motion.outline import whole_objects
 from vestcl.scene.sky import sky_mask
 
-#: Height of the camera above the road, metres, where none is told: behind the windscreen of a car. KITTI's is 1.65.
+#: Height of the camera above the road, metres, where none is given: behind the windscreen of a car. KITTI's is 1.65.
 CAMERA_HEIGHT: Final = 1.5
 
-#: So many earlier pictures are looked at. A third takes half as long again and changes the next frame's PSNR, warped
+#: This many earlier images are looked at. A third takes half as long again and changes the next frame's PSNR, warped
 #: by depth and motion, by 0.04 dB on KITTI odometry and not at all on a motorway.
 _VIEWS: Final = 2
 
-#: A car drives no farther between two pictures, metres: 216 km/h at 10 pictures a second.
+#: A car drives no farther between two images, metres: 216 km/h at 10 images per second.
 _FARTHEST: Final = 6.0
 
 #: Nothing is nearer, metres: the bonnet.
 _NEAREST: Final = 1.0
 
-#: Above the horizon where nothing is known: houses and trees beside a road, 1/m, and how little it counts.
+#: Above the horizon where nothing is known: houses and trees next to a road, 1/m, and how little it counts.
 _ASIDE, _ASIDE_COUNTS = 1 / 40, 0.002
 
-#: How well a foot tells the depth of a thing, as a share of its inverse.
+#: How well a foot gives the depth of an object, as a share of its inverse.
 _FOOT_STD: Final = 0.05
 
-#: A depth that is believed more than that tells white walls from the sky.
+#: A depth that is believed more than that separates white walls from the sky.
 _SURE: Final = 0.5
 
 Array = NDArray[np.float64]
 
 
 class MotionDepth(NamedTuple):
-    """The last picture, in space."""
+    """The last image, in space."""
 
     depth: NDArray[np.float32]
     """[1, H, W] m, above 0 everywhere, SKY_DEPTH in the sky."""
     prev_from_cur: Array
-    """[4, 4] m: from the last camera to the one before, in the same scale; no translation if the car stands."""
+    """[4, 4] m: from the last camera to the one before, in the same scale; no translation if the car is static."""
     confidence: NDArray[np.float32]
     """[1, H, W] in [0, 1]: 1 = measured, 0 = a guess from the road and from what is around."""
     speed_before: float = 0.0
@@ -63,11 +63,11 @@ def motion_depth(
     camera_height: float = CAMERA_HEIGHT,
     correspondence: Correspondence | None = None,
 ) -> MotionDepth:
-    """1/z from p' ~ K (R K^-1 p + t/z) for the flow p -> p' to up to two earlier pictures; metres by the road.
+    """1/z from p' ~ K (R K^-1 p + t/z) for the flow p -> p' to up to two earlier images; metres by the road.
 
     The camera's motion is the essential matrix of the flow. The plane n . x = ``camera_height`` that fits the points
     in the lower middle gives the scale. Where parallax is weak the plane stands in; what moves along on it takes the
-    depth of its foot; the picture's edges guide what is spread over the rest. Where the camera stands or only turns,
+    depth of its foot; the image's edges guide what is spread over the rest. Where the camera is static or only turns,
     the depth is that of a level road, and no more than a guess.
 
     Args:
@@ -77,14 +77,14 @@ def motion_depth(
         correspondence: from the last image to the one before, where it is known already; it takes most of the time.
 
     Returns:
-        Depth of the last picture, the motion to the one before, and how far the depth is to be believed.
+        Depth of the last image, the motion to the one before, and how far the depth is to be believed.
 
     Raises:
         ValueError: fewer than two images, shapes, numbers that aren't finite, or a height that is not positive.
 
     Source: SPEC section 8; Nister, An Efficient Solution to the Five-Point Relative Pose Problem, 2004.
     """
-    pictures = _pictures(images)
+    pictures = _images(images)
     K = checked.matrix("K", K, 3)
     if not camera_height > 0:
         raise ValueError(f"`camera_height` must be above 0 m, got {camera_height}")
@@ -111,7 +111,7 @@ def observe(
     """What flow from the last image to up to two earlier ones measures.
 
     Args:
-        pictures: [3, H, W] each, oldest first, two or more.
+        images: [3, H, W] each, oldest first, two or more.
         K: [3, 3] px.
         correspondence: from the last image to the one before, where it is known already.
 
@@ -125,7 +125,7 @@ def observe(
     return poses[0].dst_from_src.copy(), measure(pictures[-1], flows, poses, K)
 
 
-def _pictures(images: Sequence[ArrayLike]) -> list[NDArray[np.float32]]:
+def _images(images: Sequence[ArrayLike]) -> list[NDArray[np.float32]]:
     if len(images) < 2:
         raise ValueError(f"`images` must be two or more, got {len(images)}")
     first = checked.planes("images[0]", images[0], 3)
@@ -147,11 +147,11 @@ def _ground(plane: Array | None, rays: Array, camera_height: float) -> Array:
 
 def _complete(measured: Measured, road: Array, image: NDArray[np.float32], motion: Array) -> MotionDepth:
     at_rest = not any(measured.lengths)
-    things, feet, veiled = motion_fill.standing(measured.inverse, measured.std, measured.moving, road, at_rest)
-    std = np.where((things > 0) | measured.moving | veiled, np.inf, measured.std)
+    instances, feet, veiled = motion_fill.standing(measured.inverse, measured.std, measured.moving, road, at_rest)
+    std = np.where((instances > 0) | measured.moving | veiled, np.inf, measured.std)
     inverse, spread = motion_fill.combine(np.maximum(measured.inverse, 0), std, road)
-    inverse = np.where(things > 0, feet[things], inverse)
-    spread = np.where(things > 0, _FOOT_STD * feet[things], spread)
+    inverse = np.where(instances > 0, feet[instances], inverse)
+    spread = np.where(instances > 0, _FOOT_STD * feet[instances], spread)
     believed = motion_fill.confidence_of(inverse, spread)
     known = np.where(believed > _SURE, 1 / np.maximum(inverse, 1 / SKY_DEPTH), 0)
     sky = sky_mask(image, known[None].astype(np.float32))[0] & (road <= 0)
@@ -159,9 +159,9 @@ def _complete(measured: Measured, road: Array, image: NDArray[np.float32], motio
     inverse = np.where(guessed, _ASIDE, inverse)
     weight = np.where(sky, 0, np.where(guessed, _ASIDE_COUNTS, believed))
     whole = motion_fill.smooth(inverse, weight, road, image)
-    if things.any():  # beyond an object its depth would hide what is farther as soon as the object has left
-        around = motion_fill.smooth(inverse, np.where(things > 0, 0, weight), road, image)
-        whole = np.where(things > 0 if at_rest else motion_fill.reach(things, veiled), whole, around)
+    if instances.any():  # beyond an object its depth would hide what is farther as soon as the object has left
+        around = motion_fill.smooth(inverse, np.where(instances > 0, 0, weight), road, image)
+        whole = np.where(instances > 0 if at_rest else motion_fill.reach(instances, veiled), whole, around)
     depth = np.where(sky, SKY_DEPTH, 1 / np.clip(whole, 1 / motion_fill.FAR, 1 / _NEAREST))
     confidence = motion_fill.confidence_of(np.maximum(measured.inverse, 0), std)
     return MotionDepth(depth[None].astype(np.float32), motion, confidence[None].astype(np.float32))

@@ -1,4 +1,4 @@
-"""From measured inverse depth to a complete map: the road's plane, what stands on it, and smoothing along edges."""
+"""From measured inverse depth to a complete map: the road's plane, static objects, and smoothing along edges."""
 
 from typing import Final, NamedTuple
 
@@ -15,30 +15,30 @@ from vestcl.scene.motion.mask import without_specks
 _OFF, _OFF_SHARE = 3.0, 0.25
 
 #: The plane's standard deviation where flow agrees with it, a share of its inverse depth and as many 1/m; where flow
-#: is silent, all of it, and no less than so many 1/m: there what is around decides.
+#: is silent, all of it, and no less than this many 1/m: there what is around decides.
 _PLANE, _PLANE_FAR, _UNSEEN = 0.04, 0.001, 0.02
 
 #: Nearer than that, 1/m, the plane is road: beyond, hills and bends end it.
 _ROAD_END: Final = 1 / 120
 
-#: Regions of moving things of less than that share of the picture's pixels are dropped.
+#: Regions of dynamic objects of less than that share of the image's pixels are dropped.
 _SMALLEST: Final = 0.0006
 
-#: A region that fills that share of its convex hull is taken to be one thing, a car, with holes in its flow.
+#: A region that fills that share of its convex hull is taken to be one object, a car, with holes in its flow.
 _SOLID: Final = 0.6
 
-#: Of a thing's columns, sorted by the depth of their feet, the one that the whole thing takes.
+#: Of an object's columns, sorted by the depth of their feet, the one that the whole object takes.
 _FOOT: Final = 0.6
 
-#: Above a thing, up to that many camera heights over the camera and down to that share of its foot's depth, its roof
-#: may be; what flow finds farther away there than so many 1/m is not believed, as the roof moves with the thing.
+#: Above an object, up to that many camera heights over the camera and down to that share of its foot's depth, its roof
+#: may be; what flow finds farther away there than this many 1/m is not believed, as the roof moves with the object.
 _TALL, _WAIST, _VEILED_BELOW = 0.45, 0.5, 0.008
 
 #: While the camera drives objects' depths spread to pixels up to that share of the image's width from them: 4 px of 640
 #: are what flow misses of an outline.
 _RIM: Final = 0.006
 
-#: A measurement counts half if its standard deviation is that share of itself plus so many 1/m.
+#: A measurement counts half if its standard deviation is that share of itself plus this many 1/m.
 _HALF_SHARE, _HALF = 0.15, 0.002
 
 #: Strength of the smoother and how much it minds edges of the image (of 255). From 600 to 3000 in strength the next
@@ -52,18 +52,18 @@ Array = NDArray[np.float64]
 
 
 class Standing(NamedTuple):
-    """Things on the road that move by themselves."""
+    """Dynamic objects on the road."""
 
-    things: NDArray[np.int32]
+    instances: NDArray[np.int32]
     """[H, W], 0 = none."""
     feet: Array
-    """[n + 1] 1/m by thing, of where it touches the road."""
+    """[n + 1] 1/m by object, of where it touches the road."""
     veiled: NDArray[np.bool_]
-    """[H, W], True above things, where their upper parts may be and what was measured may be theirs."""
+    """[H, W], True above objects, where their upper parts may be and what was measured may be theirs."""
 
 
 def standing(inverse: Array, std: Array, moving: NDArray[np.bool_], road: Array, at_rest: bool = False) -> Standing:
-    """Things that are farther than the road behind them by their flow, or leave their epipolar line: they move.
+    """Objects that are farther than the road behind them by their flow, or leave their epipolar line: they move.
 
     A connected region of such pixels is one object. It stands where its lowest pixels touch the road. While the camera
     drives only parts of it are found, and it fills their convex hull; at rest its outline is known.
@@ -77,7 +77,7 @@ def standing(inverse: Array, std: Array, moving: NDArray[np.bool_], road: Array,
     """
     found = moving.copy() if at_rest else (_behind(inverse, std, road) | moving) & (road > _ROAD_END)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(without_specks(found), connectivity=8)
-    feet, things, veiled = [0.0], np.zeros(labels.shape, np.int32), np.zeros(labels.shape, bool)
+    feet, instances, veiled = [0.0], np.zeros(labels.shape, np.int32), np.zeros(labels.shape, bool)
     for label in range(1, count):
         x, y, width, height, area = stats[label]
         if area < _SMALLEST * labels.size:
@@ -89,10 +89,10 @@ def standing(inverse: Array, std: Array, moving: NDArray[np.bool_], road: Array,
         if foot <= _ROAD_END:
             continue
         feet.append(foot)
-        things[box][inside] = len(feet) - 1
+        instances[box][inside] = len(feet) - 1
         above = np.s_[: y + height, x : x + width]
         veiled[above] |= (road[above] > -_TALL * feet[-1]) & (road[above] < _WAIST * feet[-1])
-    return Standing(things, np.array(feet), veiled & (things == 0) & (inverse < _VEILED_BELOW))
+    return Standing(instances, np.array(feet), veiled & (instances == 0) & (inverse < _VEILED_BELOW))
 
 
 def _hull(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -103,16 +103,16 @@ def _hull(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return hull if region.mean() >= _SOLID * hull.mean() else region
 
 
-def reach(things: NDArray[np.int32], veiled: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def reach(instances: NDArray[np.int32], veiled: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Where objects' depths may spread to: up to edges of the image close to them, and to what they veil.
 
     Beyond is the road, or static background, which would hide them at their depth as soon as they drive away.
 
     Args:
-        things: [H, W], 0 = none.
+        objects: [H, W], 0 = none.
         veiled: [H, W].
     """
-    return dilated(things > 0, _RIM * things.shape[1]) | veiled
+    return dilated(instances > 0, _RIM * instances.shape[1]) | veiled
 
 
 def combine(inverse: Array, std: Array, road: Array) -> tuple[Array, Array]:
@@ -147,7 +147,7 @@ def confidence_of(inverse: Array, std: Array) -> Array:
 
 
 def smooth(inverse: Array, confidence: Array, road: Array, image: NDArray[np.float32]) -> Array:
-    """r + G(c (s - r)) / G(c), G the edge-aware smoother guided by the picture: bare asphalt stays a plane.
+    """r + G(c (s - r)) / G(c), G the edge-aware smoother guided by the image: bare asphalt stays a plane.
 
     Args:
         inverse: [H, W] 1/m, s.

@@ -1,4 +1,4 @@
-"""Inverse depth of every pixel, as flow to several earlier pictures shows it while the camera moves."""
+"""Inverse depth of every pixel, as flow to several earlier images shows it while the camera moves."""
 
 from collections.abc import Sequence
 from typing import Final, NamedTuple
@@ -17,12 +17,12 @@ _FLOW_ERROR, _OFF_LINE = 1.0, 1.0
 #: Error of the flow along the line, px: a constant, and a share of the flow, as long flow is found less well.
 _FLOW_STD, _FLOW_SHARE = 0.3, 0.015
 
-#: Noise of a picture, grey levels (0 to 1), over a window of so many pixels a side in which flow is found: where the
+#: Noise of an image, grey levels (0 to 1), over a window of this many pixels per side in which flow is found: where the
 #: brightness hardly changes along the epipolar line, on bare asphalt, flow finds whatever the noise and the smoothing
 #: of flow make of it.
 _GREY_STD, _WINDOW = 0.03, 9
 
-#: Views whose inverse depths differ by more standard deviations than that don't see the same thing.
+#: Views whose inverse depths differ by more standard deviations than that don't see the same object.
 _AGREE: Final = 3.0
 
 #: Pixels that compare the lengths of two motions: those that moved along their lines by more px, in both.
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 
 class Measured(NamedTuple):
-    """What flow tells, in units of the reference motion's length."""
+    """What flow measures, in units of the reference motion's length."""
 
     inverse: Array
     """[H, W] 1/unit, may be below 0 where nothing static can be."""
@@ -62,7 +62,7 @@ def measure(
 
     Args:
         image: [3, H, W] RGB in [0, 1].
-        correspondences: from the picture to each earlier one, the latest first.
+        correspondences: from the image to each earlier one, the latest first.
         poses: of the same.
         K: [3, 3] px.
 
@@ -121,7 +121,7 @@ def moving_by_turn(correspondence: Correspondence, turn: Array, K: Array) -> NDA
 
 
 def _texture(image: NDArray[np.float32]) -> Array:
-    """Sums of products of the picture's derivatives over a window, xx, yy and xy: [3, H, W]."""
+    """Sums of products of the image's derivatives over a window, xx, yy and xy: [3, H, W]."""
     grey = cv2.GaussianBlur(cv2.cvtColor(image.transpose(1, 2, 0), cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
     x, y = (cv2.Sobel(grey, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1)))
     products = [cv2.boxFilter(product, -1, (_WINDOW, _WINDOW), normalize=False) for product in (x * x, y * y, x * y)]

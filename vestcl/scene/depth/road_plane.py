@@ -1,4 +1,4 @@
-"""The road as a plane: it gives a moving camera's pictures their metres, and pixels without parallax their depth."""
+"""The road as a plane: it gives a moving camera's images their metres, and pixels without parallax their depth."""
 
 import warnings
 from typing import Final, Self
@@ -20,7 +20,7 @@ _ROLL, _PITCH = 0.1, 0.25
 #: found could be missed with less than that.
 _ROUNDS, _CERTAIN = 400, 0.99999
 
-#: On the plane: within so many standard deviations, which are no smaller than that share of the inverse depth.
+#: On the plane: within this many standard deviations, which are no smaller than that share of the inverse depth.
 _INLIER, _SHARE = 2.0, 0.03
 
 #: Fewer points, or a smaller share of them on the plane, are no road.

@@ -15,11 +15,11 @@ FAR: Final = 200.0
 #: The nearest depth that the default of ``max_disparity`` finds.
 NEAREST: Final = 3.0
 
-#: Pixels a side. 3 keeps poles, 5 rounds them off; on KITTI odometry's grey pairs it is 0.8 dB better, too (below).
+#: Pixels per side. 3 keeps poles, 5 rounds them off; on KITTI odometry's grey pairs it is 0.8 dB better, too (below).
 _BLOCK: Final = 3
 
 #: P1 and P2 of SGBM for a step of one disparity and for any larger one, by block area. OpenCV advises 8 and 32; by the
-#: right picture warped to the left, 32 gives 21.8 dB on KITTI odometry, 96 gives 22.5 and 200 gives 23.0.
+#: right image warped to the left, 32 gives 21.8 dB on KITTI odometry, 96 gives 22.5 and 200 gives 23.0.
 _PENALTIES: Final = (8 * _BLOCK**2, 200 * _BLOCK**2)
 
 #: How much better, in percent, the best disparity must be than the second: the left-right check finds what is wrong,
@@ -61,7 +61,7 @@ def stereo_depth(
 
     Disparities come from semi-global matching over all eight directions, sub-pixel, left to right and right to left.
     The weighted least squares filter spreads those that agree over those that don't, up to the edges of the left
-    picture, so what only the left camera sees takes the depth of its own side.
+    image, so what only the left camera sees takes the depth of its own side.
 
     Args:
         left: [3, H, W] RGB in [0, 1], rectified: no distortion, rows correspond. Full size is best.
@@ -73,12 +73,12 @@ def stereo_depth(
         fill: whether pixels that fail the left-right check have a depth, from the filter.
 
     Returns:
-        Depth [1, H, W] m of the left picture; 0 = invalid. With ``fill`` a picture in which nothing agrees is all
+        Depth [1, H, W] m of the left image; 0 = invalid. With ``fill`` an image in which nothing agrees is all
         invalid, any other has no invalid pixel; without it all that fail the check are invalid.
 
     Raises:
         ValueError: shapes, numbers that aren't finite, a pair that is not rectified or is the wrong way round, a
-            disparity that does not fit into the picture.
+            disparity that does not fit into the image.
 
     Source: SPEC section 8; Hirschmueller, Stereo Processing by Semiglobal Matching, 2008; Min et al., Fast Global
     Image Smoothing Based on Weighted Least Squares, 2014.
@@ -114,7 +114,7 @@ def _searched(max_disparity: int | None, focal: float, width: int) -> int:
 
 def _match(left: NDArray[np.uint8], right: NDArray[np.uint8], searched: int) -> tuple[Disparity, NDArray[np.bool_]]:
     """Filtered disparity [H, W] px, and where left and right agree. Columns are added on the left, where matching
-    has to look beyond the picture."""
+    has to look beyond the image."""
     pair = [cv2.copyMakeBorder(picture, 0, 0, searched, 0, cv2.BORDER_REPLICATE) for picture in (left, right)]
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,

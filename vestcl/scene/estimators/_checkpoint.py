@@ -1,4 +1,4 @@
-"""A checkpoint on this disk or on the Hugging Face hub: its configuration, its preparation of pictures, its network.
+"""A checkpoint on this disk or on the Hugging Face hub: its configuration, its preparation of images, its network.
 
 `transformers` is imported when a checkpoint is opened and not before, so vestcl works without it. Of its image
 processors only the configuration is read: the classes differ between its versions and some need torchvision.
@@ -126,9 +126,9 @@ def _explained(name: str) -> Iterator[None]:
     except Exception as error:  # transformers, the hub, its data classes, safetensors and pickle each raise their own
         reason = str(error).strip().partition("\n")[0][:_REASON]
         if Path(name).is_dir():
-            raise ValueError(f"{name}: is no checkpoint that transformers can load: {reason}") from error
+            raise ValueError(f"{name}: is not a checkpoint that transformers can load: {reason}") from error
         if not _HUB_NAME.fullmatch(name):
-            raise ValueError(f"{name}: there is no such folder, and it is no name on huggingface.co") from error
+            raise ValueError(f"{name}: there is no such folder, and it is not a name on huggingface.co") from error
         raise ValueError(
             f"{name}: is neither a folder here nor a checkpoint that could be had from huggingface.co ({reason}). "
             f"Where there is a network: `hf download {name} --local-dir FOLDER`; then give FOLDER"

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.scene.estimators._preparation import Preparation, one_picture, pictures
+from vestcl.scene.estimators._preparation import Preparation, one_image, pictures
 
 Number = TypeVar("Number", np.float32, np.uint8)
 
@@ -31,7 +31,7 @@ class Estimator(Generic[Number]):
         Raises:
             ValueError: another shape, or numbers outside [0, 1].
         """
-        return self.batch(one_picture(image))[0]
+        return self.batch(one_image(image))[0]
 
     @torch.inference_mode()
     def batch(self, images: ArrayLike) -> NDArray[Number]:

@@ -70,7 +70,7 @@ def read_onnx(path: str | Path) -> OnnxFile:
     except OSError as error:
         raise ValueError(f"{path}: can't be read: {error.strerror}") from error
     except (_DamagedError, ValueError) as error:  # an empty file can't be mapped; names may not be UTF-8
-        raise ValueError(f"{path}: is no ONNX file, or a truncated one ({error})") from error
+        raise ValueError(f"{path}: is not an ONNX file, or a truncated one ({error})") from error
     if missing := [file for file in network.weights if not file.is_file()]:
         raise ValueError(f"{path}: its weights are in {missing[0]}, which does not exist: keep both in one folder")
     return network

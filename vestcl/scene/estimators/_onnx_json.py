@@ -8,7 +8,7 @@ All keys may be absent. Of every network:
 - ``size``: [height, width] px, only compared with the input's.
 - ``colour``: RGB (default), BGR or grey.
 - ``scale``, ``mean``, ``std``: its input is (scale p - mean) / std of pixels p in 0 to 255; mean and std are numbers
-  or lists, one a channel.
+  or lists, one per channel.
   Defaults: scale 1/255; for depth mean 0 and std 1, for classes ImageNet's. A uint8 input is fed p itself.
 - ``fit``: stretch (default) to the input's size, or letterbox: proportions kept, edges repeated around the image.
 
@@ -73,7 +73,7 @@ class Description:
     scale: float | None = None
     """None is as the input's type wants it: 1/255, or 1 for uint8."""
     mean: tuple[float, ...] | None = None
-    """One a channel; None is as the input's type wants it: ImageNet's for classes, and 0 for depth and for uint8."""
+    """One per channel; None is as the input's type wants it: ImageNet's for classes, and 0 for depth and for uint8."""
     std: tuple[float, ...] | None = None
     fit: str = "stretch"
     metres: float = 1.0

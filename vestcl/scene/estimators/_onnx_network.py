@@ -72,8 +72,8 @@ class OnnxNetwork:
             description: of the network.
 
         Raises:
-            ValueError: no ONNX file; dynamic axes; an input that is no image; several inputs or outputs and none named;
-                a network that OpenCV cannot read or run. The message names the remedy.
+            ValueError: no ONNX file; dynamic axes; an input that is not an image; several inputs or outputs and none
+                named; a network that OpenCV cannot read or run. The message names the remedy.
         """
         file = read_onnx(description.path)
         value = _chosen(file, file.inputs, description.input, "input")
@@ -134,7 +134,7 @@ class OnnxNetwork:
         return np.ascontiguousarray(values[None] if self.layout.startswith("N") else values)
 
     def _normalisation(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """``mean`` and ``std``, one a channel, in the network's order."""
+        """``mean`` and ``std``, one per channel, in the network's order."""
         settings = self.description
         channels = 1 if settings.colour == "grey" else 3
         by_default = settings.mean is None and settings.std is None and settings.scale is None

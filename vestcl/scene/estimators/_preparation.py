@@ -1,4 +1,4 @@
-"""From a picture to what a network wants to see: reflected edges, another size, other units."""
+"""From an image to what a network wants to see: reflected edges, another size, other units."""
 
 import math
 from collections.abc import Mapping
@@ -13,26 +13,26 @@ from torch.nn import functional
 #: Height and width from which ZoeDepth's padding, 3 sqrt(size / 2), is less than the size, as a reflection must be.
 SMALLEST: Final = 5
 
-#: How far outside [0, 1] a picture may be: rounding after a resize, but not a picture in 0 ... 255.
+#: How far outside [0, 1] an image may be: rounding after a resize, but not an image in 0 ... 255.
 _SLACK: Final = 1e-3
 
 #: Pillow's numbers for its filters.
 _FILTERS: Final = {2: "bilinear", 3: "bicubic"}
 
-#: Padding by ZoeDepth's protocol: so many times sqrt(size / 2) on either side.
+#: Padding by ZoeDepth's protocol: This many times sqrt(size / 2) on either side.
 _PADDING: Final = 3
 
-#: What pictures are in for image processors, which rescale them to [0, 1].
+#: What images are in for image processors, which rescale them to [0, 1].
 _WHITE: Final = 255
 
 Fit = Literal["exact", "nearest", "within"]
-"""``size`` itself; the picture's proportions, as tall or as wide as ``size``, whichever changes the picture less; or
-the picture's proportions with a short side of size[0] and a long side of no more than size[1]."""
+"""``size`` itself; the image's proportions, as tall or as wide as ``size``, whichever changes the image less; or
+the image's proportions with a short side of size[0] and a long side of no more than size[1]."""
 
 
 @dataclass(frozen=True)
 class Preparation:
-    """(gain x - mean) / std of the resized picture x in [0, 1]."""
+    """(gain x - mean) / std of the resized image x in [0, 1]."""
 
     size: tuple[int, int]
     """(height, width), or (short side, long side) where ``fit`` is "within"."""
@@ -89,7 +89,7 @@ class Preparation:
         return int(math.sqrt(height / 2) * _PADDING), int(math.sqrt(width / 2) * _PADDING)
 
     def network_size(self, height: int, width: int) -> tuple[int, int]:
-        """(height, width) at which the network sees a picture, px."""
+        """(height, width) at which the network sees an image, px."""
         scaled: tuple[float, float] = self.size
         if self.fit == "within":
             short, long = self.size
@@ -109,7 +109,7 @@ class Preparation:
             images: [B, 3, H, W] RGB in [0, 1], H and W of SMALLEST or more.
 
         Returns:
-            [B, 3, h, w] with (h, w) = network_size of the padded picture.
+            [B, 3, h, w] with (h, w) = network_size of the padded image.
         """
         rows, columns = self.padding(*images.shape[-2:])
         if rows or columns:
@@ -127,7 +127,7 @@ def pictures(images: ArrayLike) -> NDArray[np.float32]:
     """``images`` as [B, 3, H, W] float32.
 
     Raises:
-        ValueError: another shape, pictures of less than SMALLEST px, or numbers outside [0, 1], NaN included.
+        ValueError: another shape, images of less than SMALLEST px, or numbers outside [0, 1], NaN included.
     """
     array = np.asarray(images)
     if array.ndim != 4 or array.shape[1] != 3 or not len(array) or min(array.shape[2:]) < SMALLEST:
@@ -140,11 +140,11 @@ def pictures(images: ArrayLike) -> NDArray[np.float32]:
     return np.ascontiguousarray(array, np.float32)
 
 
-def one_picture(image: ArrayLike) -> NDArray[np.float32]:
+def one_image(image: ArrayLike) -> NDArray[np.float32]:
     """``image`` as [1, 3, H, W] float32.
 
     Raises:
-        ValueError: another shape than [3, H, W], or as `pictures`.
+        ValueError: another shape than [3, H, W], or as `images`.
     """
     array = np.asarray(image)
     if array.ndim != 3:

@@ -1,6 +1,6 @@
-"""Metric depth from one picture: ZoeDepth and Depth Anything V2.
+"""Metric depth from one image: ZoeDepth and Depth Anything V2.
 
-ZoeDepth's checkpoint for indoor and outdoor has two heads and lets all pictures of a batch vote on one of them, so a
+ZoeDepth's checkpoint for indoor and outdoor has two heads and lets all images of a batch vote on one of them, so a
 dark street may be measured as a room. Here its vote is always for KITTI.
 """
 
@@ -48,9 +48,9 @@ class _AlwaysVotes(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class DepthEstimator(Estimator[np.float32]):
-    """Depth of a picture, metres; `load` makes one.
+    """Depth of an image, metres; `load` makes one.
 
-    The same picture always gives the same bits on the same machine with the same number of threads.
+    The same image always gives the same bits on the same machine with the same number of threads.
     """
 
     model: Any
@@ -58,7 +58,7 @@ class DepthEstimator(Estimator[np.float32]):
     domain: int | None
     """Which of several heads of ZoeDepth measures; None where there is but one."""
     flip: bool
-    """Whether the mirrored picture is estimated, too, and the two are averaged."""
+    """Whether the mirrored image is estimated, too, and the two are averaged."""
     device: str
 
     @classmethod
@@ -77,9 +77,9 @@ class DepthEstimator(Estimator[np.float32]):
             name_or_path: a folder, or a name on huggingface.co: it is **downloaded** when first used (0.1 to 1.4 GB)
                 and kept in the hub's own cache. `Intel/zoedepth-nyu-kitti`, `Intel/zoedepth-kitti`,
                 `depth-anything/Depth-Anything-V2-Metric-Outdoor-Small-hf` (or Base, Large).
-            size: (height, width) px at which the network sees pictures, rounded to its multiples; None is as the
-                checkpoint says: the picture's proportions, 384 px (ZoeDepth) or 518 px (Depth Anything) high.
-            flip: average with the mirrored picture, at twice the time; None is as published: ZoeDepth does.
+            size: (height, width) px at which the network sees images, rounded to its multiples; None is as the
+                checkpoint says: the image's proportions, 384 px (ZoeDepth) or 518 px (Depth Anything) high.
+            flip: average with the mirrored image, at twice the time; None is as published: ZoeDepth does.
             device: of torch.
             local_files_only: whether nothing may be downloaded. Without it and without a network, some 20 s pass before
                 the hub is given up.

@@ -12,7 +12,7 @@ from vestcl.scene.estimators._class_tables import of_movable, to_train_ids
 from vestcl.scene.estimators._onnx_file import read_onnx
 from vestcl.scene.estimators._onnx_json import Description, network_of, read_description
 from vestcl.scene.estimators._onnx_network import OnnxNetwork
-from vestcl.scene.estimators._preparation import one_picture
+from vestcl.scene.estimators._preparation import one_image
 from vestcl.scene.estimators.depth import NEAREST
 
 #: Metres. What a disparity of 0 or less becomes, and a larger depth: nothing but the sky is farther.
@@ -43,7 +43,7 @@ class OnnxDepth:
 
         Raises:
             ValueError: no such file, no ONNX, dynamic axes, a layer that OpenCV does not have, a JSON with an unknown
-                key, or an output that is no depth map; the message names the remedy.
+                key, or an output that is not a depth map; the message names the remedy.
 
         Source: SPEC, "Estimators by file".
         """
@@ -68,7 +68,7 @@ class OnnxDepth:
         Raises:
             ValueError: another shape, numbers outside [0, 1], or a network that answers with NaN.
         """
-        frame, settings = one_picture(image)[0], self.network.description
+        frame, settings = one_image(image)[0], self.network.description
         values = _plane(self.network, self.network.run(frame))
         if not np.isfinite(values).all():
             raise ValueError(f"{settings.path}: must give finite depths, got NaN or infinity")
@@ -128,7 +128,7 @@ class OnnxSegmentation:
         Raises:
             ValueError: another shape, numbers outside [0, 1], or a network that answers with NaN or with a fraction.
         """
-        frame, settings = one_picture(image)[0], self.network.description
+        frame, settings = one_image(image)[0], self.network.description
         result = self.network.run(frame)
         if not np.isfinite(result).all():
             raise ValueError(f"{settings.path}: must give finite scores, got NaN or infinity")
@@ -160,18 +160,18 @@ def _described(path: str | Path, kind: Any) -> Description:
     description = read_description(path, kind)
     if not description.given:
         file = description.path.with_suffix(".json").name
-        usual = (
+        assumed = (
             "metres, RGB in 0 to 1" if kind == "depth" else "scores of Cityscapes' classes, ImageNet's normalisation"
         )
-        _LOG.warning("%s: without %s its output is taken as %s", description.path, file, usual)
+        _LOG.warning("%s: without %s its output is taken as %s", description.path, file, assumed)
     return description
 
 
 def _plane(network: OnnxNetwork, result: NDArray[Any]) -> NDArray[np.float32]:
-    """The output [1, h, w], of one value a pixel."""
+    """The output [1, h, w], of one value per pixel."""
     sizes = [size for size in result.shape if size != 1]
     if result.ndim < 2 or result.ndim > 4 or len(sizes) > 2:
-        wanted = f"meaning {network.description.meaning} must be one value a pixel, [1, 1, H, W]"
+        wanted = f"meaning {network.description.meaning} must be one value per pixel, [1, 1, H, W]"
         raise ValueError(f"{network.description.path}: {wanted}, got {network.output} {list(result.shape)}")
     height, width = sizes if len(sizes) == 2 else result.shape[-2:]
     return np.ascontiguousarray(result, np.float32).reshape(1, height, width)

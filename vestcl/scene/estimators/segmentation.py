@@ -1,4 +1,4 @@
-"""Cityscapes' classes from one picture: SegFormer and Mask2Former."""
+"""Cityscapes' classes from one image: SegFormer and Mask2Former."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +26,7 @@ _NETWORKS: Final = {
 
 @dataclass(frozen=True, eq=False)
 class SegmentationEstimator(Estimator[np.uint8]):
-    """Train ids of a picture; `load` makes one. `vestcl.io.labels.background` makes the mask M of them."""
+    """Train ids of an image; `load` makes one. `vestcl.io.labels.background` makes the mask M of them."""
 
     model: Any
     preparation: Preparation
@@ -47,8 +47,8 @@ class SegmentationEstimator(Estimator[np.uint8]):
             name_or_path: a folder, or a name on huggingface.co: it is **downloaded** when first used (15 MB to 1 GB)
                 and kept in the hub's own cache. `nvidia/segformer-b0-finetuned-cityscapes-1024-1024` (to b5),
                 `facebook/mask2former-swin-tiny-cityscapes-semantic` (or small, large).
-            size: (height, width) px at which the network sees pictures; None is as the checkpoint says, which is
-                often a square whatever the picture's proportions. A size of the picture's own proportions keeps cars
+            size: (height, width) px at which the network sees images; None is as the checkpoint says, which is
+                often a square whatever the image's proportions. A size of the image's own proportions keeps cars
                 and people as the network has learnt them.
             device: of torch.
             local_files_only: whether nothing may be downloaded. Without it and without a network, some 20 s pass before

@@ -48,7 +48,7 @@ class EstimatedFrame(Generic[Element]):
     """Of depth: whether it is in metres."""
 
     def read(self) -> NDArray[Element]:
-        """[1, H, W] at the picture's own size: metres, or train ids."""
+        """[1, H, W] at the image's own size: metres, or train ids."""
         return self.kept.read(self.frame, self.image)
 
 
@@ -94,7 +94,7 @@ def with_estimates(
 ) -> Clip:
     """The clip with estimated depth, estimated classes, or both, in place of its own.
 
-    Nothing is computed here. A sample's `read_depth` estimates from the picture at its own size, however small the
+    Nothing is computed here. A sample's `read_depth` estimates from the image at its own size, however small the
     sample is to be, and brings that to the sample's size. The estimates of the last KEPT frames are kept.
 
     Args:

@@ -10,7 +10,7 @@ from vestcl.scene import checked
 from vestcl.scene.exposure import matched_for_flow
 from vestcl.scene.flow.optical_flow import FLOW_SIDE, flow_of_grey
 
-#: Error of flow where the picture's gradient is 1 a pixel, in pixels: bare asphalt (0.0025 a pixel on a motorway) and
+#: Error of flow where the image's gradient is 1 a pixel, in pixels: bare asphalt (0.0025 per pixel on a motorway) and
 #: sky (0.002) get more than a pixel, grass and rough asphalt (0.02 on KITTI) 0.2.
 _NOISE: Final = 0.003
 
@@ -24,13 +24,13 @@ class Correspondence(NamedTuple):
     flow_uv: NDArray[np.float32]
     """[2, H, W] px: src(p) = dst(p + flow(p))."""
     error: NDArray[np.float32]
-    """[1, H, W] px: how far off the flow may be; infinite where it leads out of the picture."""
+    """[1, H, W] px: how far off the flow may be; infinite where it leads out of the image."""
 
 
 def correspond(src: ArrayLike, dst: ArrayLike) -> Correspondence:
     """Flow f from ``src`` to ``dst``, and its error, the root of |f(p) + b(p + f(p))|^2 + (NOISE / least |grad src|)^2.
 
-    b is the flow back: there and back again should end at p. Where the picture has no texture, or the same along a
+    b is the flow back: there and back again should end at p. Where the image has no texture, or the same along a
     line, flow may do so and still be wrong, hence the second part. Where the exposure changes by 5 % or more, ``dst``
     is given the histograms of ``src`` first.
 
@@ -39,7 +39,7 @@ def correspond(src: ArrayLike, dst: ArrayLike) -> Correspondence:
         dst: [3, H, W] alike.
 
     Raises:
-        ValueError: shapes, numbers that aren't finite, or pictures too small for dense inverse search.
+        ValueError: shapes, numbers that aren't finite, or images too small for dense inverse search.
 
     Source: SPEC section 8; Kroeger et al., Fast Optical Flow using Dense Inverse Search, 2016.
     """

@@ -20,11 +20,11 @@ _FLOW_ERROR, _OFF_LINE = 1.0, 1.0
 #: Depth and flow agree if they differ, along the line, by fewer pixels plus that share of the flow.
 _AGREE, _AGREE_SHARE = 1.5, 0.05
 
-#: Where nothing else is known, flow alone tells depth if a pixel of flow is worth less than that, in 1/m: on KITTI's
-#: car at 1.2 m a frame, everywhere but within 40 px of the point it drives to.
+#: Where nothing else is known, only flow gives depth if a pixel of flow is worth less than that, in 1/m: on KITTI's
+#: car at 1.2 m per frame, everywhere but within 40 px of the point it drives to.
 _WEAKEST: Final = 0.02
 
-#: Islands of up to so many pixels whose inverse depth differs from what surrounds them by more than so much, 1/m,
+#: Islands of up to this many pixels whose inverse depth differs from what surrounds them by more than so much, 1/m,
 #: are not believed: 0.003 / m is a disparity of 1 px on KITTI.
 _ISLAND, _ISLAND_STEP = 200, 0.003
 
@@ -52,14 +52,14 @@ def refine_depth(
 
     p'(s) = project(K (R K^-1 p + s t)) moves on the epipolar line as s changes; one Gauss-Newton step from 1/z is
     exact enough, as both are close where they agree. Where they don't, one of them is wrong and the pixel has no
-    depth; where depth is missing and flow keeps to the line, flow alone tells it.
+    depth; where depth is missing and flow keeps to the line, only flow gives it.
 
     Args:
         depth: [1, H, W] m; 0 = invalid.
         inverse_std: of 1 / depth, 1/m: for a stereo pair that is the error of its disparity, px, over fx b.
         K: [3, 3] px.
         views: other frames; none leaves all as it is.
-        static: [1, H, W] bool, True where the scene stands still; elsewhere depth stays as it is.
+        static: [1, H, W] bool, True where the scene is static; elsewhere depth stays as it is.
 
     Returns:
         [1, H, W] m; 0 = invalid.

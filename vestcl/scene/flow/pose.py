@@ -1,4 +1,4 @@
-"""How a camera turned and which way it went between two pictures, from dense flow alone: the essential matrix."""
+"""How a camera turned and which way it went between two images, from dense flow alone: the essential matrix."""
 
 from typing import Final, NamedTuple
 
@@ -19,7 +19,7 @@ _FLOW_ERROR: Final = 0.5
 #: Distance to the epipolar line of RANSAC's inliers, and where the refinement's Cauchy loss bends, px.
 _OFF_LINE, _BEND = 0.7, 0.3
 
-#: A turn alone explains flow that it meets within so many px. If it explains that share of the picture's lower half,
+#: A turn alone explains flow that it meets within this many px. If it explains that share of the image's lower half,
 #: where a road would stream past, the camera has not moved.
 _TURNED, _STILL_SHARE = 0.6, 0.6
 
@@ -49,7 +49,7 @@ def relative_pose(correspondence: Correspondence, K: Array) -> Pose:
 
     It has several minima, as a turn and a step aside look alike. So it is searched from what RANSAC over five points
     finds and from a motion along the camera's axis, and the lowest is taken. Where a turn alone explains the lower half
-    of the picture, t = 0.
+    of the image, t = 0.
 
     Args:
         correspondence: from src to dst.

@@ -11,10 +11,10 @@ from vestcl.scene.inpainting.sides import carry_on
 #: Surroundings count by 1 / (1/z + that)^2, 1/m: what was hidden is likelier to go on behind a hole than what hid it.
 _FAR: Final = 0.01
 
-#: OpenCV resizes up to so many channels at once.
+#: OpenCV resizes up to this many channels at once.
 _CV_CHANNELS: Final = 4
 
-#: Holes up to that share of the picture's width across are cracks.
+#: Holes up to that share of the image's width across are cracks.
 _CRACK: Final = 0.006
 
 
@@ -27,7 +27,7 @@ def fill_holes(
     """Push and pull: a hole takes the weighted mean of the next coarser level, which is filled likewise.
 
     Holes inside are filled from the far side first, those that reach the border from all sides alike;
-    there what is seen goes on along the lines through the vanishing point, if that is known (`carry_on`).
+    there what is seen continues along the lines through the vanishing point, if that is known (`carry_on`).
 
     Args:
         image: [C, H, W]; what is in the holes does not matter.
@@ -60,7 +60,7 @@ def push_pull(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[n
 
 
 def deep_holes(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """What remains of ``hole`` [1, H, W] without cracks, and without holes that reach the picture's border."""
+    """What remains of ``hole`` [1, H, W] without cracks, and without holes that reach the image's border."""
     side = 2 * round(_CRACK * hole.shape[2] / 2) + 1
     brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     wide = cv2.morphologyEx(hole[0].astype(np.uint8), cv2.MORPH_OPEN, brush).astype(bool)
@@ -68,7 +68,7 @@ def deep_holes(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _at_border(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The holes [H, W] that reach the picture's border: nobody hid them, they were out of sight."""
+    """The holes [H, W] that reach the image's border: nobody hid them, they were out of sight."""
     count, labels = cv2.connectedComponents(hole.astype(np.uint8))
     at_border = np.zeros(count, bool)
     for side in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):

@@ -19,7 +19,7 @@ DEFAULT: Final = "regions"
 #: `vestcl.constants.BEHIND`, in the depth's own type.
 _BEHIND: Final = np.float32(constants.BEHIND)
 
-#: The SPEC's dilation, px, and the width of the pictures that it is told of.
+#: The SPEC's dilation, px, and the width of the images that it is reported.
 _DILATE, _WIDTH = 10, 832
 
 #: Nothing hidden is farther, metres.
@@ -34,7 +34,7 @@ def inpaint_background(
     dilate: int | None = None,
     method: str | Inpainter | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """I_bg and D_bg: the frame where M = 1; where M = 0 what surrounds the foreground, dilated, goes on behind it.
+    """I_bg and D_bg: the frame where M = 1; where M = 0 what surrounds the foreground, dilated, continues behind it.
 
     Depth: D_bg = max(1 / max(road, wall), 1.01 D), see `structure_behind`. Colour: by ``method``.
 
@@ -47,7 +47,7 @@ def inpaint_background(
         method: a name of `inpainters.METHODS`, "lama:PATH", a function as `Inpainter`; None is DEFAULT.
 
     Returns:
-        [3, H, W] and [1, H, W] m; the arguments themselves where nothing is hidden. A picture that is all foreground
+        [3, H, W] and [1, H, W] m; the arguments themselves where nothing is hidden. An image that is all foreground
         has nothing to go by: it keeps its colour, at 1.01 D.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Ways to fill holes of a picture, by name: OpenCV's, scikit-image's, LaMa, and our own."""
+"""Ways to fill holes of an image, by name: OpenCV's, scikit-image's, LaMa, and our own."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,7 +18,7 @@ from vestcl.scene.inpainting.holes import push_pull
 #: Radius of the surroundings that OpenCV's methods look at, px.
 _RADIUS: Final = 5
 
-#: Frequency-selective and biharmonic filling take seconds for 10,000 pixels: holes are solved in pictures of at most
+#: Frequency-selective and biharmonic filling take seconds for 10,000 pixels: holes are solved in images of at most
 #: that height, and enlarged.
 _SLOW_HEIGHT: Final = 96
 
@@ -27,19 +27,19 @@ _LAMA_MULTIPLE: Final = 8
 
 
 class Inpainter(Protocol):
-    """Fills holes of a picture from what surrounds them."""
+    """Fills holes of an image from what surrounds them."""
 
     def __call__(
         self, colour: NDArray[np.float32], hole: NDArray[np.bool_], road: NDArray[np.bool_]
     ) -> NDArray[np.float32]:
         """``colour`` [3, H, W] in [0, 1] with ``hole`` [1, H, W] filled.
 
-        ``road`` [1, H, W] tells where the road's plane is seen or, in the hole, would be; a method may ignore it.
+        ``road`` [1, H, W] is True where the road's plane is seen or, in the hole, would be; a method may ignore it.
         """
 
 
 def regions(colour: NDArray[np.float32], hole: NDArray[np.bool_], road: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Push and pull, the road from the road alone and what stands on it from the rest."""
+    """Push and pull, the road from the road alone and the static objects on it from the rest."""
     filled = colour
     for part in (road, ~road):
         known = part & ~hole
@@ -102,7 +102,7 @@ class Lama:
         try:
             self._module = torch.jit.load(str(path), map_location="cpu").eval()
         except RuntimeError as error:
-            raise ValueError(f"{path}: is no TorchScript module ({str(error).splitlines()[0]})") from error
+            raise ValueError(f"{path}: is not a TorchScript module ({str(error).splitlines()[0]})") from error
 
     def __call__(
         self, colour: NDArray[np.float32], hole: NDArray[np.bool_], road: NDArray[np.bool_]
@@ -166,7 +166,7 @@ def _reduced(
     hole: NDArray[np.bool_],
     solve: Callable[[NDArray[np.float32], NDArray[np.bool_]], NDArray[np.float32]],
 ) -> NDArray[np.float32]:
-    """The holes of ``colour`` from the solution of a picture that is no higher than _SLOW_HEIGHT."""
+    """The holes of ``colour`` from the solution of an image that is no higher than _SLOW_HEIGHT."""
     height, width = hole.shape[1:]
     scale = min(1.0, _SLOW_HEIGHT / height)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))

@@ -1,4 +1,4 @@
-"""What no frame saw at an image's sides: a street goes on along the lines through its vanishing point."""
+"""What no frame saw at an image's sides: a street continues along the lines through its vanishing point."""
 
 from typing import Final
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from vestcl.scene.flow.correspondence import sample
 
-#: Where neighbouring lines enter the hole is smoothed over so many of them, both sides, in an image 832 wide, lest
+#: Where neighbouring lines enter the hole is smoothed over this many of them, both sides, in an image 832 wide, lest
 #: the ragged edge of a hole is drawn out.
 _SMOOTH, _WIDTH = 9, 832
 

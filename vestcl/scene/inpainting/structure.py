@@ -1,4 +1,4 @@
-"""The shape of what is hidden in a street: the road goes on as a plane, and walls go down to it."""
+"""The shape of what is hidden in a street: the road continues as a plane, and walls go down to it."""
 
 from typing import Final, NamedTuple
 
@@ -31,7 +31,7 @@ class Structure(NamedTuple):
 
 
 def structure_behind(inverse: NDArray[np.float32], hole: NDArray[np.bool_]) -> Structure:
-    """1/z = max(road, wall): road = the level plane that the lower middle of the picture lies on, if there is one.
+    """1/z = max(road, wall): road = the level plane that the lower middle of the image lies on, if there is one.
 
     wall is that of the first known pixel above, as walls are as far at their foot as at their top; where the hole is
     narrow, or nothing known is above, it is interpolated along the row.

@@ -32,14 +32,14 @@ _FLOW_MARGIN: Final = 1.25
 #: Squared errors beyond are of something else, and noise of the camera that all have: 0.3 % of white.
 _MOST, _NOISE = 0.05, 1e-5
 
-#: Errors are smoothed over so many pixels of an image 832 wide (standard deviations): before they are brought to t
+#: Errors are smoothed over this many pixels of an image 832 wide (standard deviations): before they are brought to t
 #: along the flow, so that it need not be exact, and then.
 _WIDTH, _BEFORE, _AFTER = 832, 2.0, 8.0
 
 #: Errors of flow itself grow with this power of their mean over the least of the other candidates.
 _WHOLE: Final = 6.0
 
-#: Flow that leaves the rigid motion by more pixels an interval than that is a wrong match.
+#: Flow that leaves the rigid motion by more pixels per interval than that is a wrong match.
 _LARGEST: Final = 40.0
 
 #: From that squared error on a pixel's motion is more its surroundings' than its own. On five windows of kitti_clip at
@@ -70,7 +70,7 @@ class BacktestFrame(NamedTuple):
 
 
 def residual_flow(frame: BacktestFrame) -> Array:
-    """r [2, H, W] px an interval, forward: what flow shows beyond the camera's motion, (p' - (p + flow)) / elapsed.
+    """r [2, H, W] px per interval, forward: what flow shows beyond the camera's motion, (p' - (p + flow)) / elapsed.
 
     p' is where the point would have been in the frame before at rest. 0 where the difference is no motion but a wrong
     match.
@@ -145,8 +145,8 @@ def untested(frame: BacktestFrame, by_flow: bool = False) -> Array:
         frame: that is looked at.
         by_flow: as in `candidates`.
     """
-    alike = np.array([1, 1e3, 1, 1e3, *[1e3] * by_flow], np.float32) * np.float32(1e-4)
-    return np.broadcast_to(alike[:, None, None], (len(alike), *frame.depth.shape[1:])).copy()
+    prior = np.array([1, 1e3, 1, 1e3, *[1e3] * by_flow], np.float32) * np.float32(1e-4)
+    return np.broadcast_to(prior[:, None, None], (len(prior), *frame.depth.shape[1:])).copy()
 
 
 def by_step(errors: Sequence[Array], by_flow: bool = False) -> tuple[Array, ...]:
@@ -230,7 +230,7 @@ def _pixels(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _followed(residual: Array, ahead: float) -> Array:
-    """[2, H, W] px: the way along ``residual`` px an interval, looked up again after each interval or less."""
+    """[2, H, W] px: the way along ``residual`` px per interval, looked up again after each interval or less."""
     x, y = np.asarray(pixel_centres(*residual.shape[1:]) - 0.5, np.float32)
     steps = max(math.ceil(ahead - 1e-6), 1)
     way = np.zeros_like(residual)

@@ -37,7 +37,7 @@ from vestcl.scene.motion.gauss_markov import (
 
 Array = NDArray[np.float64]
 
-#: Standard deviation of a measured rotation, rad an axis: what PnP over a dense flow gives on a driving video with
+#: Standard deviation of a measured rotation, rad per axis: what PnP over a dense flow gives on a driving video with
 #: depth, and of the yaw without depth, as a turn and a step aside look much alike.
 _TURN_NOISE: Final = (np.radians(0.045), np.radians(0.12))
 
@@ -77,7 +77,7 @@ _ACROSS: Final = (0.03, 0.1)
 _ACROSS_SECONDS: Final = (0.1, 0.3, 1.0)
 _ACROSS_NOISE: Final = 0.004
 
-#: So many motions are the fewest to filter: one has no trend.
+#: This many motions are the fewest to filter: one has no trend.
 FEWEST: Final = 2
 
 

@@ -1,4 +1,4 @@
-"""The camera's own motion without a network: correspondences and depth, PnP with RANSAC, constant velocity."""
+"""The camera's motion without a network: correspondences and depth, PnP with RANSAC, constant velocity."""
 
 from collections.abc import Sequence
 from typing import Final, NamedTuple

@@ -34,9 +34,9 @@ class Model:
     drift: Array
     """A [n, n], 1/s."""
     density: Array
-    """Q [n, n], squared units of the states a second."""
+    """Q [n, n], squared units of the states per second."""
     rate: Array
-    """C [n], units of the measurement a second."""
+    """C [n], units of the measurement per second."""
     covariance: Array
     """P0 [n, n], of the states before anything is measured."""
     noise: float
@@ -74,7 +74,7 @@ def driven_rate(decay: float, seconds: float, rms: float, spread: float | None =
     Args:
         decay: s; infinity for a rate that does not return to 0, which then needs ``spread``.
         seconds: correlation time of a, s.
-        rms: of a, units a second squared.
+        rms: of a, units per second squared.
         spread: standard deviation of the rate before anything is measured; None is the stationary one.
     """
     drift = np.array([[-1 / decay, 1], [0, -1 / seconds]])

@@ -1,4 +1,4 @@
-"""Background masks with no weights at all: whatever moves in a way that the camera's own motion can't explain."""
+"""Background masks with no weights at all: whatever moves in a way that the camera's motion can't explain."""
 
 from typing import Final
 
@@ -17,11 +17,11 @@ _FLOW_ERROR: Final = 1.0
 #: a static scene stay below on KITTI.
 _MOVES, _MOVES_SHARE = 2.0, 0.15
 
-#: Holes and specks up to that share of the picture's width are closed and dropped, and so are regions of less than
+#: Holes and specks up to that share of the image's width are closed and dropped, and so are regions of less than
 #: that share of its pixels: a pedestrian at 25 m has 0.1 %.
 _BRUSH, _SMALLEST = 0.006, 0.0008
 
-#: A region is road, and no thing on it, if more than that share of it lies flat: its normal is that close to vertical.
+#: A region is road, and no object on it, if more than that share of it lies flat: its normal is that close to vertical.
 #: What seems to move there is a line whose flow slides along it, a reflection or a shadow.
 _ROAD, _FLAT = 0.7, 0.8
 
@@ -68,7 +68,7 @@ def rigid_pixels(
 
 
 def lies_flat(depth: NDArray[np.float32], K: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Where the surface [H, W] is horizontal: of a plane n . x = 1, 1/z = n . K^-1 p, the gradient of 1/z tells n."""
+    """Where the surface [H, W] is horizontal: of a plane n . x = 1, 1/z = n . K^-1 p, the gradient of 1/z gives n."""
     inverse = cv2.blur(np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0), (5, 5))
     right, down = cv2.Sobel(inverse, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(inverse, cv2.CV_32F, 0, 1, scale=1 / 8)
     y, x = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
@@ -89,6 +89,6 @@ def _regions(moves: NDArray[np.bool_], flat: NDArray[np.bool_]) -> NDArray[np.bo
     """The regions of ``moves`` [H, W] that are large, and no road."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(without_specks(moves), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA]
-    things = (area >= _SMALLEST * moves.size) & (np.bincount(labels[flat], minlength=count) <= _ROAD * area)
-    things[0] = False
-    return things[labels]
+    instances = (area >= _SMALLEST * moves.size) & (np.bincount(labels[flat], minlength=count) <= _ROAD * area)
+    instances[0] = False
+    return instances[labels]

@@ -1,4 +1,4 @@
-"""How things move by themselves: regions of the foreground, and each one's velocity from flow and depth."""
+"""How dynamic objects move: regions of the foreground, and each one's velocity from flow and depth."""
 
 from typing import Final
 
@@ -13,32 +13,32 @@ from vestcl.scene.depth.road_plane import linear, rays_of
 from vestcl.scene.flow.correspondence import Correspondence, sample
 from vestcl.scene.flow.parallax import moved_pixels
 
-#: Neighbours whose depths differ by a larger factor belong to different things.
+#: Neighbours whose depths differ by a larger factor belong to different objects.
 _JUMP: Final = 0.08
 
-#: Regions of fewer pixels, as a share of the picture, are too small to measure and follow the camera alone.
+#: Regions of fewer pixels, as a share of the image, are too small to measure and follow the camera alone.
 _SMALLEST: Final = 0.0003
 
 #: Forward-backward error beyond which flow is not believed, px.
 _FLOW_ERROR: Final = 1.0
 
-#: Error of flow, px; residuals beyond so many times of it count linearly (Huber).
+#: Error of flow, px; residuals beyond this many times of it count linearly (Huber).
 _FLOW_STD, _HUBER = 0.5, 2.0
 
-#: So many neighbouring pixels err alike, and count as one.
-_ALIKE: Final = 50.0
+#: This many neighbouring pixels err alike, and count as one.
+_CORRELATED: Final = 50.0
 
-#: What is expected of a velocity before anything is measured, metres a frame: 20 m/s at 10 Hz across and ahead, and
+#: What is expected of a velocity before anything is measured, metres per frame: 20 m/s at 10 Hz across and ahead, and
 #: nothing jumps.
 _SPEED_STD: Final = (2.0, 0.1, 2.0)
 
-#: A thing is said to move if that explains its flow so much better: mean robust cost, in variances of flow.
+#: An object is said to move if that explains its flow so much better: mean robust cost, in variances of flow.
 _GAIN: Final = 1.5
 
-#: Pixels of a thing that take part, evenly chosen: neighbours say the same.
+#: Pixels of an object that take part, evenly chosen: neighbours say the same.
 _PIXELS: Final = 3000
 
-#: Residual flow beyond so many pixels is no motion but a wrong match, and below so many it is noise.
+#: Residual flow beyond this many pixels is no motion but a wrong match, and below this many it is noise.
 _LARGEST, _NOISE = 40.0, 0.2
 
 #: Up to that share of believed flow around a pixel nothing is corrected, from that one on everything: bare asphalt has
@@ -50,14 +50,14 @@ _ROUNDS: Final = 6
 
 
 def segment(mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> NDArray[np.int32]:
-    """The foreground cut into things: connected, and with no jump of depth inside.
+    """The foreground cut into objects: connected, and with no jump of depth inside.
 
     Args:
         mask: [1, H, W], True = background.
         depth: [1, H, W] m, above 0.
 
     Returns:
-        [H, W]: 1 ... n by thing, 0 = background and things too small to measure.
+        [H, W]: 1 ... n by object, 0 = background and objects too small to measure.
     """
     foreground, log_depth = ~mask[0], np.log(depth[0])
     jump = np.zeros_like(foreground)
@@ -71,21 +71,21 @@ def segment(mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> NDArray[np.i
     return _grown(renumbered[labels], foreground)
 
 
-def _grown(things: NDArray[np.int32], foreground: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Foreground that no thing owns goes to the nearest one, if it touches it: others are too small to measure."""
-    if not things.any():
-        return things
+def _grown(instances: NDArray[np.int32], foreground: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Foreground that no object owns goes to the nearest one, if it touches it: others are too small to measure."""
+    if not instances.any():
+        return instances
     _, nearest = cv2.distanceTransformWithLabels(
-        (things == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        (instances == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
     _, parts = cv2.connectedComponents(foreground.astype(np.uint8), connectivity=8)
     owner, part = np.zeros((2, nearest.max() + 1), np.int32)
-    owner[nearest[things > 0]], part[nearest[things > 0]] = things[things > 0], parts[things > 0]
+    owner[nearest[instances > 0]], part[nearest[instances > 0]] = instances[instances > 0], parts[instances > 0]
     return np.where(foreground & (part[nearest] == parts), owner[nearest], 0)
 
 
 def velocities(
-    things: NDArray[np.int32],
+    instances: NDArray[np.int32],
     depth: NDArray[np.float32],
     depth_prev: NDArray[np.float32],
     inverse_std: float,
@@ -93,14 +93,14 @@ def velocities(
     prev_from_cur: NDArray[np.float64],
     K: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """v_n [n + 1, 3] m a frame, in the camera's axes at t: thing n was at x - v_n, had the camera not moved.
+    """v_n [n + 1, 3] m per frame, in the camera's axes at t: object n was at x - v_n, had the camera not moved.
 
     min over v of the Huber costs of project(K (R (x - v) + t)) - p - flow(p), and of the inverse depth there against
-    what the frame before measured, plus |v|^2 / SPEED_STD^2. Row 0, and things that need no motion of their own to be
+    what the frame before measured, plus |v|^2 / SPEED_STD^2. Row 0, and objects that need no motion of their own to be
     explained, are 0.
 
     Args:
-        things: [H, W], from `segment`.
+        objects: [H, W], from `segment`.
         depth: [1, H, W] m at t; 0 = invalid.
         depth_prev: [1, H, W] m at t - 1; 0 = invalid.
         inverse_std: of 1 / depth, 1/m.
@@ -110,24 +110,24 @@ def velocities(
 
     Source: SPEC section 8.
     """
-    result = np.zeros((int(things.max()) + 1, 3))
+    result = np.zeros((int(instances.max()) + 1, 3))
     moved = moved_pixels(correspondence.flow_uv)
     before = np.divide(1, depth_prev, out=np.zeros_like(depth_prev), where=depth_prev > 0)
     inverse_prev = sample(before, moved[0] - 0.5, moved[1] - 0.5)[0]
-    believed = (things > 0) & (depth[0] > 0) & (correspondence.error[0] < _FLOW_ERROR)
-    for thing, here in enumerate(pixels_by_thing(things, believed, len(result))):
-        if thing == 0 or len(here) < _SMALLEST / 2 * things.size:
+    believed = (instances > 0) & (depth[0] > 0) & (correspondence.error[0] < _FLOW_ERROR)
+    for instance, here in enumerate(pixels_by_instance(instances, believed, len(result))):
+        if instance == 0 or len(here) < _SMALLEST / 2 * instances.size:
             continue
         y, x, points = some_points(here, _PIXELS, depth, K)
         measured = np.column_stack([moved[:, y, x].T, inverse_prev[y, x]])
-        result[thing] = _velocity(points, measured, inverse_std, prev_from_cur, K)
+        result[instance] = _velocity(points, measured, inverse_std, prev_from_cur, K)
     return result
 
 
-def pixels_by_thing(things: NDArray[np.int32], where: NDArray[np.bool_], count: int) -> list[NDArray[np.intp]]:
-    """Flat indices, rising, of the pixels of things 0 to ``count`` - 1 that are True in ``where`` [H, W]."""
+def pixels_by_instance(instances: NDArray[np.int32], where: NDArray[np.bool_], count: int) -> list[NDArray[np.intp]]:
+    """Flat indices, rising, of the pixels of objects 0 to ``count`` - 1 that are True in ``where`` [H, W]."""
     flat = np.flatnonzero(where)
-    of = things.ravel()[flat]
+    of = instances.ravel()[flat]
     order = np.argsort(of, kind="stable")
     return np.split(flat[order], np.cumsum(np.bincount(of, minlength=count))[:-1])
 
@@ -135,7 +135,7 @@ def pixels_by_thing(things: NDArray[np.int32], where: NDArray[np.bool_], count: 
 def some_points(
     here: NDArray[np.intp], most: int, depth: NDArray[np.float32], K: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
-    """Rows and columns of at most so many of the pixels ``here`` [N], flat, evenly chosen; what they show, [N, 3] m."""
+    """Rows and columns of at most this many pixels of ``here`` [N], flat, evenly chosen; their points, [N, 3] m."""
     y, x = np.divmod(here[:: -(-len(here) // most)], depth.shape[2])
     rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1) @ np.linalg.inv(K).T
     return y, x, rays * depth[0, y, x, None]
@@ -151,12 +151,12 @@ def follow_flow(
 ) -> NDArray[np.float32]:
     """``velocity`` corrected, at constant depth, by what flow shows beyond it: v - z' K^-1 r, as far as r is no noise.
 
-    r = p + flow(p) - project(K (R (x - v) + t)), smoothed up to the picture's edges and shrunk by the error of flow:
+    r = p + flow(p) - project(K (R (x - v) + t)), smoothed up to the image's edges and shrunk by the error of flow:
     r max(0, 1 - NOISE^2 / |r|^2). Shadows that travel with a car, bodies that bend and errors of depth go on as they
     did, too.
 
     Args:
-        velocity: [3, H, W] m a frame.
+        velocity: [3, H, W] m per frame.
         image: [3, H, W] RGB in [0, 1].
         depth: [1, H, W] m, above 0; the sky keeps its velocity.
         correspondence: from t to t - 1.
@@ -164,7 +164,7 @@ def follow_flow(
         K: [3, 3] px.
 
     Returns:
-        [3, H, W] m a frame.
+        [3, H, W] m per frame.
     """
     height, width = depth.shape[1:]
     points = rays_of(K, height, width) * depth - velocity
@@ -188,7 +188,7 @@ def _velocity(
     points: NDArray[np.float64], measured: NDArray[np.float64], inverse_std: float, prev_from_cur: NDArray[np.float64],
     K: NDArray[np.float64],
 ) -> NDArray[np.float64]:  # fmt: skip
-    """One thing's v [3], or 0 if that explains as much. ``measured`` [N, 3]: px, px, 1/m."""
+    """One object's v [3], or 0 if that explains as much. ``measured`` [N, 3]: px, px, 1/m."""
     known = np.column_stack([np.ones((len(points), 2), bool), measured[:, 2] > 0])
     spread = np.array([_FLOW_STD, _FLOW_STD, 2 * inverse_std])
     prior = np.diag(np.square(np.reciprocal(_SPEED_STD)))
@@ -196,7 +196,7 @@ def _velocity(
     for _ in range(_ROUNDS):
         predicted, jacobian = _predict(points, v, prev_from_cur, K)
         residual = np.where(known, (measured - predicted) / spread, 0)
-        weight = known * np.minimum(1, _HUBER / np.maximum(np.abs(residual), 1e-9)) / _ALIKE
+        weight = known * np.minimum(1, _HUBER / np.maximum(np.abs(residual), 1e-9)) / _CORRELATED
         scaled = jacobian / spread[:, None]
         normal = np.einsum("nij,ni,nik->jk", scaled, weight, scaled) + prior
         right = np.einsum("nij,ni,ni->j", scaled, weight, residual) - prior @ v

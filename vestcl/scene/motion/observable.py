@@ -13,7 +13,7 @@ from vestcl.scene.motion.mask import lies_flat, rigid_pixels
 #: of a camera's noise is a tenth of it, that of a facade 20 times as much.
 _HALF: Final = 5e-5
 
-#: Gradients are looked at over so many pixels of an image 832 wide (standard deviation).
+#: Gradients are looked at over this many pixels of an image 832 wide (standard deviation).
 _WIDTH, _WINDOW = 832, 2.5
 
 
@@ -54,7 +54,7 @@ def on_the_road(
     """``flow_uv``; on what is level the flow f of the camera's motion, and `observable` of what is beyond it.
 
     Lane markings and asphalt then stay part of the road: what flow shows of them beyond f is a guess. Shadows have
-    edges, and what stands on the road is not level.
+    edges, and what is on the road is not level.
 
     Args:
         flow_uv: [2, H, W] px, to another frame.

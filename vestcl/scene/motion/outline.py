@@ -23,8 +23,8 @@ _BAND, _INSIDE = 0.015, 0.004
 #: Forward-backward error beyond which flow is not believed, px.
 _FLOW_ERROR: Final = 1.0
 
-#: Differences of colour are averaged over windows of so many pixels, count up to the first number, and decide from the
-#: second one on: noise of an image.
+#: Differences of colour are averaged over windows of this many pixels, count up to the first number, and decide from
+#: the second one on: noise of an image.
 _WINDOW, _OTHER, _NOISE = 5, 0.15, 0.006
 
 #: Gaps of a region of up to twice that share of the image's width are closed, holes of up to that share of its area.

@@ -1,7 +1,7 @@
-"""Which velocities the pictures confirm: what moves by v looks in the frame before, at x - v, as it does now.
+"""Which velocities the images confirm: what moves by v looks in the frame before, at x - v, as it does now.
 
 Flow is wrong where it is large, on cars that pass close by above all, and says of those that are parked that they move.
-What a picture shows of a wrong motion is something else.
+What an image shows of a wrong motion is something else.
 """
 
 from typing import Final, NamedTuple
@@ -15,7 +15,7 @@ from vestcl.scene.depth.completion import smooth
 from vestcl.scene.depth.road_plane import linear, rays_of
 from vestcl.scene.exposure import STRIDE, nearest, tone_curve
 from vestcl.scene.flow.correspondence import sample
-from vestcl.scene.motion.objects import pixels_by_thing, some_points
+from vestcl.scene.motion.objects import pixels_by_instance, some_points
 from vestcl.scene.regions import mean_by_region, superpixels
 
 Array = NDArray[np.float64]
@@ -26,33 +26,33 @@ _OTHER: Final = 0.15
 #: A motion is believed if it leaves so much of the difference at most ...
 _LEFT: Final = 0.9
 
-#: ... and takes that much from it at least: noise of a picture.
+#: ... and takes that much from it at least: noise of an image.
 _NOISE: Final = 0.002
 
-#: Metres a frame: what is slower stands. Half of a walk at 10 Hz.
+#: Metres per frame: what is slower is static. Half of a walk at 10 Hz.
 _SLOWEST: Final = 0.05
 
-#: Things are searched along the camera's axes x and z up to so many metres a frame: at 10 Hz 8 m/s across and 32 m/s
-#: against us, by steps of a pixel or as many as this to either side.
+#: Objects are searched along the camera's axes x and z up to this many metres per frame: at 10 Hz 8 m/s across and 32
+#: m/s against us, by steps of a pixel or as many as this to either side.
 _AXES: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _FARTHEST, _MOST = np.array([0.8, 3.2]), 60
 
 #: Flow on a wrong depth gives speeds that nothing has: at 10 Hz 45 m/s, or half of the way to the camera in a frame.
 _FASTEST, _CLOSER = 4.5, 0.5
 
-#: Then around the best in both at once: so many pixels, in turn.
+#: Then around the best in both at once: This many pixels, in turn.
 _SIZES: Final = (2.0, 2.0, 1.0, 1.0, 0.5, 0.5, 0.25, 0.12)
 _AROUND: Final = np.array([[x, z] for x in (-1.0, 0.0, 1.0) for z in (-1.0, 0.0, 1.0)])
 
-#: Pixels of a thing that take part in the search and in what decides, evenly chosen. With fewer nothing is searched.
+#: Pixels of an object that take part in the search and in what decides, evenly chosen. With fewer nothing is searched.
 _SEARCHED, _COMPARED, _FEWEST = 300, 1500, 30
 
-#: Of a thing's pixels so many must have been inside the frame before.
+#: Of an object's pixels this many must have been inside the frame before.
 _INSIDE: Final = 0.5
 
-#: Differences are averaged over windows of so many pixels, then up to edges and over superpixels of that area. Against
-#: edges only, superpixels at 416 columns changed PSNR at t+1, t+2 and t+3 by 0.00, 0.02 and 0.01 dB in the mean over 12
-#: sets of windows (22 windows), by -0.05 to 0.09 dB in each.
+#: Differences are averaged over windows of this many pixels, then up to edges and over superpixels of that area.
+#: Against edges only, superpixels at 416 columns changed PSNR at t+1, t+2 and t+3 by 0.00, 0.02 and 0.01 dB in the mean
+#: over 12 sets of windows (22 windows), by -0.05 to 0.09 dB in each.
 _WINDOW, _AREA = 5, 25.0
 
 
@@ -90,8 +90,8 @@ class Pair(NamedTuple):
 
         Args:
             depth: [1, H, W] m at t; 0 = unknown.
-            velocity: [3, H, W] m a frame; None is 0 everywhere. Points that move otherwise are wrong matches, which the
-                median tolerates.
+            velocity: [3, H, W] m per frame; None is 0 everywhere. Points that move otherwise are wrong matches, which
+                the median tolerates.
         """
         grid = np.s_[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
         rows, columns = (np.arange(STRIDE // 2, size, STRIDE) + 0.5 for size in depth.shape[1:])
@@ -105,36 +105,37 @@ class Pair(NamedTuple):
         return self._replace(image_prev=curve(self.image_prev))
 
 
-def search(things: NDArray[np.int32], by_flow: Array, depth: NDArray[np.float32], pair: Pair) -> Array:
-    """v_n [n + 1, 3] m a frame for each thing: of 0, what flow says, and steps ahead and aside, what looks most alike.
+def search(instances: NDArray[np.int32], by_flow: Array, depth: NDArray[np.float32], pair: Pair) -> Array:
+    """v_n [n + 1, 3] m per frame for each object: of 0, what flow says, and steps ahead and aside, what looks most
+    alike.
 
     min over v of the mean over pixels of min(|I(p) - I_prev(project(K (R (x - v) + t)))|, OTHER), first along the
     camera's axes x and z, then around the best by ever smaller steps. Unless that is LEFT times what v = 0 gives or
-    less, the thing stands still. I_prev is shown as I is exposed, by the colours of the static background.
+    less, the object is static. I_prev is shown as I is exposed, by the colours of the static background.
 
     Args:
-        things: [H, W], 0 = background.
-        by_flow: [n + 1, 3] m a frame, `vestcl.scene.motion.objects.velocities`.
+        objects: [H, W], 0 = background.
+        by_flow: [n + 1, 3] m per frame, `vestcl.scene.motion.objects.velocities`.
         depth: [1, H, W] m at t; 0 = invalid.
         pair: both frames.
 
     Returns:
-        Row 0 is 0, as are things that stand, and all that are too small to tell.
+        Row 0 is 0, as are static objects, and all that are too small to measure.
     """
     found = np.zeros_like(by_flow)
-    pair = pair.equally_exposed(np.where(things > 0, np.float32(0), depth))
-    valid = (things > 0) & (depth[0] > 0)
+    pair = pair.equally_exposed(np.where(instances > 0, np.float32(0), depth))
+    valid = (instances > 0) & (depth[0] > 0)
     before = np.ascontiguousarray(pair.image_prev.transpose(1, 2, 0))
-    for thing, here in enumerate(pixels_by_thing(things, valid, len(found))):
-        if thing == 0 or len(here) < _FEWEST:
+    for instance, here in enumerate(pixels_by_instance(instances, valid, len(found))):
+        if instance == 0 or len(here) < _FEWEST:
             continue
         y, x, points = some_points(here, _COMPARED, depth, pair.K)
-        found[thing] = _search(_Points(points, pair.image[:, y, x].T, before, pair), by_flow[thing])
+        found[instance] = _search(_Points(points, pair.image[:, y, x].T, before, pair), by_flow[instance])
     return found
 
 
 class _Points(NamedTuple):
-    """Points of a thing that are looked for in the frame before."""
+    """Points of an object that are looked for in the frame before."""
 
     points: Array
     """[m, 3] m at t."""
@@ -161,60 +162,60 @@ class _Points(NamedTuple):
         return np.where(inside, (red + green + blue) / np.float32(3), np.float32(np.nan))
 
 
-def _search(thing: _Points, by_flow: Array) -> Array:
-    """One thing's v [3]."""
-    few = thing.every(-(-len(thing.points) // _SEARCHED))
-    pixel = _of_a_pixel(few.points, thing.pair.K)
+def _search(instance: _Points, by_flow: Array) -> Array:
+    """One object's v [3]."""
+    few = instance.every(-(-len(instance.points) // _SEARCHED))
+    pixel = _of_a_pixel(few.points, instance.pair.K)
     lines = [
         np.arange(-count, count + 1)[:, None] * step * axis
         for axis, step, count in zip(_AXES, pixel, np.minimum(_FARTHEST / pixel, _MOST).astype(int), strict=True)
     ]
-    is_possible = np.linalg.norm(by_flow) < _FASTEST and -by_flow[2] < _CLOSER * np.median(thing.points[:, 2])
+    is_possible = np.linalg.norm(by_flow) < _FASTEST and -by_flow[2] < _CLOSER * np.median(instance.points[:, 2])
     tries = np.concatenate([np.zeros((1, 3)), by_flow[None] * is_possible, *lines])
     best = tries[_costs(few, tries).argmin()]
     for size in _SIZES:
         around = best + size * (_AROUND * pixel) @ _AXES
         best = around[_costs(few, around).argmin()]
-    still, moving = _costs(thing, np.stack([np.zeros(3), best]))
+    still, moving = _costs(instance, np.stack([np.zeros(3), best]))
     moves = np.linalg.norm(best) >= _SLOWEST and moving < min(_LEFT * still, still - _NOISE)
     return best if moves else np.zeros(3)
 
 
 def _of_a_pixel(points: Array, K: Array) -> Array:
-    """Metres aside and ahead that shift a thing's pixels by about one, or so many that MOST reach FARTHEST, [2]."""
+    """Metres aside and ahead that shift an object's pixels by about one, or this many that MOST reach FARTHEST, [2]."""
     x, y, z = np.median(points, axis=0)
     spread = np.hypot(x, y) + np.abs(points[:, :2] - (x, y)).max()
     return np.asarray(np.maximum(np.array([z, z**2 / spread]) / K[0, 0], _FARTHEST / _MOST), np.float64)
 
 
-def _costs(thing: _Points, tries: Array) -> NDArray[np.float32]:
+def _costs(instance: _Points, tries: Array) -> NDArray[np.float32]:
     """Mean unlikeness of each of ``tries`` [n, 3], infinite where too little is inside the frame before; but for v = 0
     a single point will do."""
-    difference = np.minimum(thing.unlikeness(tries), np.float32(_OTHER))
+    difference = np.minimum(instance.unlikeness(tries), np.float32(_OTHER))
     inside = np.isfinite(difference)
     count = inside.sum(1)
     mean = np.where(inside, difference, 0).sum(1) / np.maximum(count, 1)
-    enough = (count >= _INSIDE * len(thing.points)) | ((count > 0) & ~tries.any(1))
+    enough = (count >= _INSIDE * len(instance.points)) | ((count > 0) & ~tries.any(1))
     return np.where(enough, mean, np.float32(np.inf))
 
 
 def confirmed(
     corrected: NDArray[np.float32], velocity: NDArray[np.float32], depth: NDArray[np.float32], pair: Pair
 ) -> NDArray[np.float32]:
-    """v + g (c - v): ``velocity`` v, corrected to c as far as the pictures then look more alike.
+    """v + g (c - v): ``velocity`` v, corrected to c as far as the images then look more alike.
 
     g = (d_v - d_c) / ((1 - LEFT) d_v + NOISE / 2), between 0 and 1, where d is the difference of both frames' colours
-    under a velocity: the mean of what it is when smoothed up to the picture's edges and when averaged over superpixels,
+    under a velocity: the mean of what it is when smoothed up to the image's edges and when averaged over superpixels,
     which keep to one depth, too.
 
     Args:
-        corrected: c [3, H, W] m a frame, from `vestcl.scene.motion.objects.follow_flow`.
-        velocity: v [3, H, W] m a frame.
+        corrected: c [3, H, W] m per frame, from `vestcl.scene.motion.objects.follow_flow`.
+        velocity: v [3, H, W] m per frame.
         depth: [1, H, W] m at t, above 0.
         pair: both frames, which may be exposed differently.
 
     Returns:
-        [3, H, W] m a frame.
+        [3, H, W] m per frame.
     """
     pair = pair.equally_exposed(depth, velocity)
     guide, regions = checked.pixels(pair.image), superpixels(pair.image, depth, area=_AREA)

@@ -18,15 +18,15 @@ from vestcl.data.street.driving.road import RoadDrive
 Array = NDArray[np.float64]
 Wave = tuple[float, float]
 
-#: Frames a second of a recorded trajectory, as KITTI's.
+#: Frames per second of a recorded trajectory, as KITTI's.
 RECORDED_FPS: Final = 10.0
 
 #: Half the window of the smoothing that takes turns, hills and lane changes out of a recording, in frames: over these
 #: 4 s a parabola follows a turn to within a lane's room, and what is faster than about 0.25 Hz is left.
 HALF_WINDOW: Final = 20
 
-#: Bounds on what is left: metres to the side (the lane has 0.6 m beside a car) and down, then radians of yaw, pitch and
-#: roll. They touch little: 99 % of KITTI odometry 00 and 06 stays within 0.24 m, 0.05 m, 3.3, 1.0 and 1.1 degrees.
+#: Bounds on what is left: metres to the side (the lane has 0.6 m next to a car) and down, then radians of yaw, pitch
+#: and roll. They touch little: 99 % of KITTI odometry 00 and 06 stays within 0.24 m, 0.05 m, 3.3, 1.0 and 1.1 degrees.
 LIMITS: Final = (0.4, 0.15, np.radians(4.0), np.radians(2.0), np.radians(2.0))
 
 #: (amplitude, hertz) of the waves that make up the sway. Their root mean squares and frequencies lie between those of
@@ -71,7 +71,7 @@ class Sway:
     """Endless smooth driving: every number is a sum of sines."""
 
     speed: float
-    """Mean, metres a second."""
+    """Mean, metres per second."""
     phase: float
     """Radians; where all the waves are at time 0."""
     amplitude: float = 1.0
@@ -120,7 +120,7 @@ class Recording:
     """The wobble and the speed of a recorded trajectory on a straight road; played forwards and backwards in turn."""
 
     frames: tuple[tuple[float, ...], ...]
-    """[N][6], RECORDED_FPS a second; see the module."""
+    """[N][6], RECORDED_FPS per second; see the module."""
 
     @classmethod
     def from_trajectory(cls, trajectory: ArrayLike) -> "Recording":
@@ -131,10 +131,10 @@ class Recording:
         Savitzky and Golay 1964), bounded by x -> L tanh(x / L), L of LIMITS.
 
         Args:
-            trajectory: [N, 4, 4] world_from_cam in metres, RECORDED_FPS a second, N of 2 or more.
+            trajectory: [N, 4, 4] world_from_cam in metres, RECORDED_FPS per second, N of 2 or more.
 
         Raises:
-            ValueError: another shape, or a matrix that is no rigid motion.
+            ValueError: another shape, or a matrix that is not a rigid motion.
         """
         poses = np.asarray(trajectory, np.float64)
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) < 2:
@@ -188,7 +188,7 @@ class Recording:
 
     @property
     def speed(self) -> float:
-        """Mean, metres a second."""
+        """Mean, metres per second."""
         return self.frames[-1][0] / (len(self.frames) - 1) * RECORDED_FPS
 
 

@@ -36,7 +36,7 @@ CROWD_SPACING: Final = 9.0
 #: ... and how many times as many people walk.
 CROWD_WALKERS: Final = 3.0
 
-#: A slot's number fits so many bits of an instance, its file's tag comes above: 8 million slots to either side.
+#: A slot's number fits this many bits of an instance, its file's tag comes above: 8 million slots to either side.
 SLOT_BITS: Final = 24
 
 
