@@ -1,4 +1,4 @@
-"""Who may import whom, read from the source without running it: the rooms' order, no circles, nothing private."""
+"""Who may import whom, read from the source without running it: the order of packages, no circles, nothing private."""
 
 import ast
 import functools
@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LIBRARY = sorted((ROOT / "vestcl").rglob("*.py"))
 SOURCES = [*LIBRARY, *sorted((ROOT / "train").rglob("*.py"))]
 
-#: The rooms of vestcl; each may import those of its own line and of the lines above it.
+#: The packages of vestcl; each may import those of its own line and of the lines above it.
 ORDER = (
     ("_version", "constants", "shapes", "geometry", "clock", "times", "interrupt"),
     ("opencl", "io"),

@@ -1,4 +1,4 @@
-"""How the commands of train end: what a user can put right is one line on stderr, with exit status 2."""
+"""How the commands of train end: what a user can correct is one line on stderr, with exit status 2."""
 
 import re
 import sys
@@ -17,7 +17,7 @@ from vestcl import opencl
 #: Exit status of a command that could not do what it was asked for.
 FAILED: Final = 2
 
-#: What a user can put right: settings, files, the disk, devices, other processes.
+#: What a user can correct: settings, files, the disk, devices, other processes.
 ERRORS: Final = (ValueError, OSError, opencl.DeviceError, CheckpointError, LostProcessError)
 
 #: What torch says, at any place of the main process, when a data loader's process has ended.

@@ -59,7 +59,7 @@ _PUBLISHED: Final = ("size", "steps", "first", "last")
 
 @interrupt.command
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; what a user can put right is reported in one line, with exit code 2."""
+    """The command; what a user can correct is reported in one line, with exit code 2."""
     config = command_line.parsed(Evaluation, "python -m train.evaluate", __doc__, arguments)
     try:
         evaluate(config)
@@ -145,7 +145,7 @@ def setup_of(config: Evaluation, protocol: Protocol) -> Setup:
     """
     names = [path.stem for path in config.model]
     if twice := sorted({name for name in names if names.count(name) > 1 or name == GEOMETRIC}):
-        raise ValueError(f"`model` must have files with a stem of their own each, got {', '.join(twice)} again")
+        raise ValueError(f"`model` must have files with different stems, got {', '.join(twice)} again")
     models = {path.stem: Forecaster.load(path) for path in config.model}
     trunk = None if config.squeeze is None else load_trunk("squeezenet1_0", config.squeeze)
     lpips = None if config.lpips is None else Lpips.load("alexnet", *config.lpips)

@@ -24,7 +24,7 @@ class Export:
     """Round a model's weights to float16."""
 
     checkpoint: tyro.conf.Positional[Path]
-    """A training checkpoint's folder, whose running mean is taken, or a model's file."""
+    """A training checkpoint's folder, whose EMA is taken, or a model's file."""
     out: tyro.conf.Positional[Path]
     """The file to write, *.safetensors."""
 

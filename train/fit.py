@@ -91,7 +91,7 @@ def fit(config: Config, *, go_on: bool = False, ranks: Ranks | None = None, devi
     Args:
         config: of the run.
         go_on: from the last checkpoint of ``config.out``, if there is one.
-        ranks: the processes that train together; None is this one alone.
+        ranks: the processes that train together; None is a single process.
         device: OpenCL device; None is `Ranks.device`'s choice.
 
     Returns:
@@ -165,7 +165,7 @@ def _stop_signal() -> Iterator[_Stop]:
 
 
 class _Run:
-    """The model and its running mean, through all stages."""
+    """The model and its EMA, through all stages."""
 
     def __init__(self, config: Config, ranks: Ranks, stop: _Stop) -> None:
         self.config, self.ranks, self.stop = config, ranks, stop

@@ -122,7 +122,7 @@ class Samples:
         return planes, targets
 
     def _sample(self, number: int) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-        """Every file once per epoch, in an order of its own; one of its entries, varied."""
+        """Every file once per epoch, in its own order; one of its entries, varied."""
         epoch, place = divmod(number, len(self.files))
         file = self.files[np.random.default_rng([self.seed, epoch]).permutation(len(self.files))[place]]
         rng = np.random.default_rng([self.seed, 1, number])

@@ -47,7 +47,7 @@ __all__ = [
     "use",
 ]
 
-# others are in the file of their own name
+# others are in the file of the same name
 _FILES = {
     **dict.fromkeys(("Raster", "Skipped", "composite", "rasterize", "skipped"), "ops.splat"),
     **dict.fromkeys(("DeviceError", "DeviceInfo", "devices", "use"), "opencl"),

@@ -13,7 +13,7 @@ Seen = Callable[[str, Any], None]
 Recorder = Callable[[str, int, int], object]
 """Called with a span's name, start and end, nanoseconds of time.perf_counter_ns, in the span's thread."""
 
-#: What records spans of all threads: `vestcl.opencl.trace`, which there is one of in a process.
+#: What records spans of all threads: `vestcl.opencl.trace`, one per process.
 _recorder: Recorder | None = None
 
 

@@ -117,7 +117,7 @@ def is_interrupt(error: BaseException | None) -> bool:
 
 @contextlib.contextmanager
 def shielded() -> Iterator[None]:
-    """Processes started inside the ``with`` block don't get SIGINT: a terminal sends it to parent and children alike.
+    """Processes started inside the ``with`` block don't get SIGINT: a terminal sends it to the parent and its children.
 
     The parent gets it when the block ends.
     """

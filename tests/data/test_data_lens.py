@@ -17,7 +17,7 @@ from vestcl.data.readers.folder import open_folder
 from vestcl.data.sources import ImageFile
 
 HEIGHT, WIDTH = 60, 96
-#: With pixel centres at integers, far enough from the middle that no two axes are alike.
+#: With pixel centres at integers, far enough from the middle that no two axes are equal.
 PINHOLE = {"fx": 80.0, "fy": 76.0, "cx": 49.0, "cy": 28.0}
 OPENCV = {"k1": -0.25, "k2": 0.06, "p1": 0.004, "p2": -0.006, "k3": 0.01}
 RATIONAL = {"k1": 0.4, "k2": 0.1, "k3": 0.02, "k4": 0.6, "k5": 0.2, "k6": 0.05}

@@ -101,7 +101,7 @@ def test_ms_ssim_like_a_plain_computation(height: int, width: int) -> None:
 
 
 def test_ms_ssim_by_hand_of_constant_images() -> None:
-    """Structure is 1 everywhere, so that the luminance of the coarsest level alone remains."""
+    """Structure is 1 everywhere, so that the luminance of the coarsest level only remains."""
     first, second = (torch.full((1, 3, 176, 176), value, dtype=torch.float64) for value in (0.3, 0.8))
     luminance = (2 * 0.24 + metrics.C1) / (0.09 + 0.64 + metrics.C1)
     assert float(metrics.ms_ssim(first, second)) == pytest.approx(luminance**0.1333, abs=1e-12)

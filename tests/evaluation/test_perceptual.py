@@ -111,7 +111,7 @@ def test_equal_images_symmetry_and_noise(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["lpips", "squeeze", "vgg_loss"])
 def test_gradients_are_the_slopes(name: str) -> None:
-    """In float64 and along the gradient alone: gradcheck would run the networks thousands of times."""
+    """In float64 and along the gradient only: gradcheck would run the networks thousands of times."""
     measure = distance(name, torch.float64)
     pair = [image.double().requires_grad_() for image in image_pair(name)]
     grads = torch.autograd.grad(measure(*pair).sum(), pair)

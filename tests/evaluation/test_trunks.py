@@ -71,7 +71,7 @@ def caffe(state: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
     ],
 )
 def test_sizes_of_the_public_networks(name: str, parameters: int, shapes: list[tuple[int, int]]) -> None:
-    with torch.device("meta"):  # shapes alone
+    with torch.device("meta"):  # shapes only
         trunk = Trunk(name)
         maps = trunk(torch.empty(2, 3, 224, 224))
     assert sum(p.numel() for p in trunk.parameters()) == parameters

@@ -128,7 +128,7 @@ def test_ply_refuses_what_it_cannot_write(tmp_path: Path) -> None:
         ({"frame": 5}, "`frame` must be 1 ... 4"),
         ({"views": []}, "`views` must be one camera or more, got none"),
         ({"views": ["above"]}, "above"),
-        ({"views": [View("source", np.eye(4)), "source"]}, "`views` must have a name of their own"),
+        ({"views": [View("source", np.eye(4)), "source"]}, "`views` must have different names"),
         ({"model": "vest-xl"}, "vest-xl: is not a model"),
     ],
 )
@@ -189,7 +189,7 @@ def test_a_repository(model: vestcl.Forecaster, tmp_path: Path, monkeypatch: pyt
     assert same(vestcl.Forecaster.from_pretrained("someone/net", revision="v1"), model)
     assert asked == [("someone/net", "model.safetensors", "v1")]
     with pytest.raises(
-        ValueError, match="someone/else: is not a file here, and can't be had from the hub: 404 Not Found"
+        ValueError, match="someone/else: is not a file here, and not available on the hub: 404 Not Found"
     ):
         vestcl.Forecaster.from_pretrained("someone/else")
 

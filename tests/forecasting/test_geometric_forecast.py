@@ -117,7 +117,7 @@ def test_depth_is_that_of_the_future_frame() -> None:
 
 
 def test_what_the_frame_before_showed_is_at_its_place() -> None:
-    """Its cloud alone, two frame intervals on: 4 dB and more better than itself again, where it shows
+    """Its cloud only, two frame intervals on: 4 dB and more better than itself again, where it shows
     anything and in the oncoming car."""
     clip, cameras = perception(*PASSING).clip, true_cameras(perception(*PASSING).clip)
     seen = perception(*PASSING)
@@ -296,7 +296,7 @@ def test_a_plain_video_beats_repeating_its_last_frame() -> None:
 
 @pytest.mark.parametrize("without", [(NOW,), (NOW - 1,), (NOW - 2, NOW - 1)])
 def test_frames_without_depth_between_others(without: tuple[int, ...]) -> None:
-    """Where a scan is missing depth is from motion, and flow itself is a candidate, or is none, in all tests alike."""
+    """Where a scan is missing depth is from motion, and flow itself is either a candidate in all tests or in none."""
     clip = drive(PLAIN[0], start=PLAIN[1], samples=1).clip
     known = [replace(sample, right=None, depth=None if i in without else sample.depth) for i, sample in enumerate(clip)]
     made = forecast_clip(replace(clip, samples=tuple(known)), NOW, 2, [LEFT])

@@ -281,7 +281,7 @@ def test_only_frames_up_to_t_are_read() -> None:
 
 
 def test_what_was_seen_before_changes_nothing() -> None:
-    """A sequence that is worked through has the same choice as its frame alone."""
+    """A sequence that is worked through has the same choice as a single frame."""
     noisy, before = stir_all(model(camera=0.3)), Perception(clip())
     for index in (3, 4):
         network.forecast_frames(before, noisy, index, 1, VIEWS)

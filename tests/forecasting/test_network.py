@@ -128,7 +128,7 @@ def test_it_is_the_models_own_forecast(start: str, mode: Any) -> None:
 
 
 def test_a_forecast_reports_its_stages_and_what_it_skipped() -> None:
-    """Of this forecast alone; the model is as it was."""
+    """Of this forecast only; the model is as it was."""
     network = model()
     views = [*VIEWS, View("again", np.eye(4))]
     first = forecast_frames(perception(), network, 2, 1, views, learned="all")

@@ -101,7 +101,7 @@ def test_objects_move_by_time() -> None:
 
 @pytest.mark.parametrize("gap", [3.0, 7.0])
 def test_a_gap_that_is_too_long_to_match(gap: float) -> None:
-    """The camera continues as before the gap, where flow across it is lost; a line says so."""
+    """The camera continues as before the gap, where flow across it is lost; a line reports it."""
     street = Street.generate(4)
     seconds = [0.0, 0.1, 0.2, 0.2 + gap / 10, 0.3 + gap / 10]
     clips = [street_clip(street, 1, HEIGHT, WIDTH, start=second)[0] for second in seconds]
@@ -150,7 +150,7 @@ def test_the_prior_is_per_interval() -> None:
 
 
 def test_another_interval_than_the_networks() -> None:
-    """vest-s learned at 10 Hz: its corrections of motion are left out, and a line says so."""
+    """vest-s learned at 10 Hz: its corrections of motion are left out, and a line reports it."""
     model = Forecaster.from_pretrained("vest-s")
     clip = dataclasses.replace(fine(), samples=fine().samples[:4]).resized(48, 160)
     made = network.forecast_frames(Perception(clip), model, 3, 2, [SOURCE], learned="all")

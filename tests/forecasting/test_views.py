@@ -128,7 +128,7 @@ def test_mistakes_are_reported(text: str, message: str, mono: Sample) -> None:
 def test_views_need_names_of_their_own(stereo: Sample) -> None:
     views = parse_views(["source", "right", "1,0,0", "1,0,0,name=other"], stereo)
     assert [view.name for view in views] == ["source", "right", "x1", "other"]
-    with pytest.raises(ValueError, match=r"`view` must have a name of its own each, got right twice; add name="):
+    with pytest.raises(ValueError, match=r"`view` must have different names, got right twice; add name="):
         parse_views(["right", "source", "right"], stereo)
 
 

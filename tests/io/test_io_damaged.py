@@ -116,7 +116,7 @@ def test_what_is_no_file(tmp_path: Path, name: str) -> None:
 
 
 def test_files_that_are_too_long(tmp_path: Path) -> None:
-    """A sparse file of a terabyte takes no room and is not read."""
+    """A sparse file of a terabyte takes no memory and is not read."""
     for name in READERS:
         with (tmp_path / name).open("wb") as file:
             file.truncate(1 << 40)
@@ -205,7 +205,7 @@ def test_exr_of_every_compression_is_read(tmp_path: Path, name: str, height: int
 
 
 def test_bytes_after_the_end_are_allowed(tmp_path: Path) -> None:
-    """Telephones append to JPEGs; a thumbnail in EXIF data has an end of its own."""
+    """Telephones append to JPEGs; a thumbnail in EXIF data has its own end."""
     whole = contents(tmp_path)
     for name in ("rgb.png", "rgb.jpg", "progressive.jpg"):
         (tmp_path / name).write_bytes(whole[name] + b"appended")

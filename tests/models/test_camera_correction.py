@@ -113,7 +113,7 @@ def test_a_static_camera_is_not_corrected() -> None:
 
 
 def test_samples_of_different_intervals_share_a_batch() -> None:
-    """A batch gives what each sample alone gives, and the same rates at another frame rate give another input."""
+    """A batch gives what each sample gives separately, and the same rates at another frame rate give another input."""
     network, given = correction(), prior()
     mean = torch.randn(3, 8)
     together = network(mean, network.numbers(given), given)

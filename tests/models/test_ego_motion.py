@@ -245,7 +245,7 @@ def test_nothing_is_learned_from_the_foreground(frame: str) -> None:
 
 
 def test_all_is_looked_at_where_no_background_is_left() -> None:
-    """One sample of the batch is all foreground: it is not NaN, and each sample stays what it is alone."""
+    """One sample of the batch is all foreground: it is not NaN, and each sample is the same as in a batch of one."""
     network, arguments = moving(), scene(2, 16, 24)
     arguments["mask_cur"][1] = 0
     together = numbers(network, arguments)

@@ -16,7 +16,7 @@ SMALL = EncoderConfig(widths=(8, 12, 16), blocks=(2, 1, 1), decoder=(12, 8), fea
 
 
 def resnet34() -> dict[str, torch.Tensor]:
-    """Random weights under the public names; what must be ignored takes no room."""
+    """Random weights under the public names; what must be ignored takes no memory."""
     state = {"conv1.weight": torch.randn(64, 3, 7, 7) * 0.1, **batch_norm("bn1", 64)}
     channels = 64
     for layer, (width, blocks) in enumerate([(64, 3), (128, 4), (256, 6), (512, 3)], start=1):
@@ -209,7 +209,7 @@ class _Code:
     [
         ({"state_dict": {}, "epoch": 3}, r"must hold a state dict \(name -> tensor\), got \['dict', 'int'\]"),
         ([torch.zeros(1)], r"must hold a state dict \(name -> tensor\), got list"),
-        ({"conv1.weight": _Code()}, "must be a PyTorch file of tensors alone"),
+        ({"conv1.weight": _Code()}, "must be a PyTorch file that holds only tensors"),
     ],
 )
 def test_refuses_other_files_of_torch(content: object, message: str, tmp_path: Path) -> None:
@@ -221,8 +221,8 @@ def test_refuses_other_files_of_torch(content: object, message: str, tmp_path: P
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("weights.pth", b"", "must be a PyTorch file of tensors alone"),
-        ("weights.pth", b"no weights at all", "must be a PyTorch file of tensors alone"),
+        ("weights.pth", b"", "must be a PyTorch file that holds only tensors"),
+        ("weights.pth", b"no weights at all", "must be a PyTorch file that holds only tensors"),
         ("weights.safetensors", b"", "must be a safetensors file of weights"),
         ("weights.safetensors", b"\x02\0\0\0\0\0\0\0[]", "must be a safetensors file of weights"),
         ("weights.safetensors", b"\xff\xff\xff\xff\0\0\0\0{}", "must be a safetensors file of weights"),

@@ -81,7 +81,7 @@ def test_a_point_a_pixel_and_one_behind_each_of_the_foreground() -> None:
 
 @pytest.mark.parametrize("name", ["whole", "joint", "routing", "paper"])
 def test_a_gradient_for_every_tensor(name: str) -> None:
-    """The image's error reaches encoder, both motions and refinement; those of motion through the splatter alone."""
+    """The image's error reaches encoder, both motions and refinement; those of motion through the splatter only."""
     model, pair, K = stir(Forecaster(ABLATIONS[name])), pair_of(2, 32, 48), camera(2, 32, 48)
     if model.object_motion is not None and model.object_motion.routing is not None:
         nn.init.constant_(model.object_motion.routing.choose.bias, 3.0)
@@ -171,7 +171,7 @@ def test_every_ablation_goes_back_and_forth(name: str) -> None:
 
 @pytest.mark.parametrize("joint", [False, True])
 def test_a_batch_is_its_images(joint: bool) -> None:
-    """Clouds of 8 and of 12 inpainted points, side by side and alone."""
+    """Clouds of 8 and of 12 inpainted points, together and separately."""
     model = stir(Forecaster(change(render=RenderConfig(joint=joint)))).eval()
     pair, K = pair_of(2, 33, 50), camera(2, 33, 50)
     K[1, :2, :2] *= 1.1
@@ -255,7 +255,7 @@ def test_refuses_arguments() -> None:
 
 
 def test_what_is_seen_is_never_hidden_by_what_is_inpainted() -> None:
-    """A car drives away from the road that was painted 1 % behind it: it stays in front unless depth alone rules."""
+    """A car drives away from the road that was painted 1 % behind it: it stays in front unless only depth decides."""
     red, green = torch.tensor([[1.0, 0, 0, 1.0]]), torch.tensor([[0, 1.0, 0, 1.0]])
     xyz, moved = torch.tensor([[0, 0, 10.0], [0, 0, 10.1]]), torch.tensor([[0, 0, 2.0], [0, 0, 0]])
     features, colour = torch.cat([red, green]).split([1, 3], dim=1)

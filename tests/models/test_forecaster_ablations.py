@@ -198,7 +198,7 @@ def bonnet(batch: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("start", ["rest", "prior"])
 def test_ego_motion_does_not_look_at_the_recording_car(start: str) -> None:
-    """Whatever shines on the bonnet, the camera moves alike; the two tokens' rows above are all that counts.
+    """Whatever shines on the bonnet, the camera's motion is the same; the two tokens' rows above are all that counts.
 
     Convolutions reach beyond their token, so the features of the tokens themselves are changed.
     """

@@ -304,7 +304,7 @@ def test_each_thread_keeps_two_frames() -> None:
     keep(0, 1)
     end = threading.Barrier(4)
     threads = [threading.Thread(target=lambda n=n: (keep(n, n + 1), end.wait())) for n in (2, 4, 6)]
-    for thread in threads:  # all run until the end, so that each has a number of its own
+    for thread in threads:  # all run until the end, so that each has its own number
         thread.start()
         while len(known()) < 2 * (2 + threads.index(thread)):
             time.sleep(0.001)

@@ -25,7 +25,7 @@ from vestcl.models.networks.ego_motion import RigidMotion
 #: What is said of three intervals, turn and shift: a metre to the side, one more metre, and one back again.
 SIDEWAYS = [0.0, 0, 0, 10, 0, 0], [0.0, 0, 0, 20, 0, 0], [0.0, 0, 0, -10, 0, 0]
 
-#: Every colour shown by its own pixel alone, with a path of three intervals.
+#: Every colour shown by its own pixel only, with a path of three intervals.
 SHARP_PATH = dataclasses.replace(SHARP, start="prior", ego_motion=SMALL.ego_motion)
 
 

@@ -22,7 +22,7 @@ from vestcl.models.steps.encode import encode
 from vestcl.models.steps.render import _reaching
 from vestcl.scene.layers import LayerBatch
 
-#: As vest-s in all that can be skipped, and with convolutions that reach so little that an image has room around it.
+#: As vest-s in all that can be skipped, and with convolutions that reach so little that an image has space around it.
 ENCODER = EncoderConfig(widths=(8, 8, 8), blocks=(1, 1, 1), decoder=(8, 8), features=4, background="frame")
 SPARE = dataclasses.replace(
     SMALL,
@@ -98,7 +98,7 @@ def test_without_foreground_nothing_is_dynamic() -> None:
 
 
 def test_what_is_static_is_kept_static() -> None:
-    """Of two cars the one that was measured to move; a pixel alone does not."""
+    """Of two cars the one that was measured to move; a single pixel does not."""
     network, (prev, cur), K = model(), scene(), camera(1, HEIGHT, WIDTH)
     for one in (prev, cur):
         one.mask.fill_(1)
@@ -277,7 +277,7 @@ def test_a_copy_remembers_nothing_of_other_weights(tmp_path: Path) -> None:
 
 
 def test_the_inpainted_shows_in_inner_holes_only() -> None:
-    """A block in the middle and one at the border leave holes; the splatted background is behind the first alone."""
+    """A block in the middle and one at the border leave holes; the splatted background is behind the first only."""
     torch.manual_seed(2)
     network, K = Forecaster(SPARE).eval(), camera(1, HEIGHT, WIDTH)
     rear = wall(HEIGHT, WIDTH, 20.0)
@@ -303,7 +303,7 @@ def test_the_inpainted_shows_in_inner_holes_only() -> None:
 
 
 def test_inner_holes_need_to_know_what_is_open() -> None:
-    with pytest.raises(ValueError, match='`inpainted` may be "inner" with `previous` "uncovered" alone'):
+    with pytest.raises(ValueError, match='`inpainted` may be "inner" with `previous` "uncovered" only'):
         RenderConfig(inpainted="inner")
 
 

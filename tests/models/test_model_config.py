@@ -96,7 +96,7 @@ def test_every_variant_changes_its_own_field() -> None:
 
 
 def test_a_path_needs_a_prior() -> None:
-    """The variant from rest forecasts the next frame alone; from its prior vest-s forecasts five."""
+    """The variant from rest forecasts the next frame only; from its prior vest-s forecasts five."""
     paths = {}
     for name in ("vest-paper", "vest-s", "vest-s+from-rest", "vest-s+from-prior", "vest-paper+from-prior"):
         ego_motion = configuration(name).ego_motion
@@ -178,8 +178,8 @@ def test_frozen_and_hashable() -> None:
             '`ego_motion.path` must be 1 with `start` "rest", got 2',
         ),
         (lambda: ObjectMotionConfig(shape="vgg"), '`shape` must be "paper" or "dmvfn", got \'vgg\''),  # type: ignore[arg-type]
-        (lambda: ObjectMotionConfig(scales=(4, 2)), r"`scales` and `widths` must be as long, got \(4, 2\)"),
-        (lambda: ObjectMotionConfig(scales=(), widths=()), "`scales` and `widths` must be as long"),
+        (lambda: ObjectMotionConfig(scales=(4, 2)), r"`scales` and `widths` must have equal length, got \(4, 2\)"),
+        (lambda: ObjectMotionConfig(scales=(), widths=()), "`scales` and `widths` must have equal length"),
         (lambda: ObjectMotionConfig(scales=(2,), widths=(42,)), "`widths` multiples of 4"),
         (lambda: ObjectMotionConfig(scales=(0,), widths=(8,)), "`scales` must be >= 1"),
         (

@@ -1,4 +1,4 @@
-"""Accelerated networks: the same forecasts, no gradients, and the plain network left alone."""
+"""Accelerated networks: the same forecasts, no gradients, and the plain network unchanged."""
 
 import copy
 import ctypes

@@ -48,7 +48,7 @@ def test_without_a_correction_it_is_the_mean_of_both() -> None:
 
 
 def test_a_constant_flow_and_a_sure_mask_shift_one_frame() -> None:
-    """Each block's bias alone speaks: nine times a ninth of 2 px to the right in frame 1, and a mask for frame 1."""
+    """Only each block's bias acts: nine times a ninth of 2 px to the right in frame 1, and a mask for frame 1."""
     network = VoxelFlowNetwork()
     for block in network.blocks:
         torch.nn.init.zeros_(block.out.weight)

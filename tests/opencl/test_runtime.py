@@ -1,4 +1,4 @@
-"""Devices, programs, launches and profiles, with kernels that a test writes into a folder of its own."""
+"""Devices, programs, launches and profiles, with kernels that a test writes into a separate folder."""
 
 import contextvars
 import dataclasses
@@ -220,7 +220,7 @@ def test_results_of_one_launch_feed_the_next(kernels: Path, fresh: opencl.Sessio
 
 def test_a_cpu_reads_the_array_itself(kernels: Path, fresh: opencl.Session) -> None:
     if fresh.info.kind != "CPU":
-        pytest.skip("this device has a memory of its own")
+        pytest.skip("this device has its own memory")
     array, result = np.ones(8, np.float32), np.empty(8, np.float32)
     with fresh.job() as job:
         arguments: list[Any] = [np.float32(2), job.read(array), job.write(result)]

@@ -61,7 +61,7 @@ def test_gradcheck(mapped_session: opencl.Session, float64: torch.dtype) -> None
 
 @pytest.mark.parametrize("length", [1e-5, 1e-7, 1e-9, 1e-20])
 def test_gradcheck_of_short_quaternions(session: opencl.Session, float64: torch.dtype, length: float) -> None:
-    """Above the floor of 1e-8 only the direction counts, below it q is divided by the floor alone."""
+    """Above the floor of 1e-8 only the direction counts, below it q is divided by the floor only."""
     arguments = scene(2, 5, float64)
     shape = torch.nn.functional.normalize(arguments["quaternion"].detach()).requires_grad_()
     points_xyz, translation = arguments["points_xyz"], arguments["translation"]

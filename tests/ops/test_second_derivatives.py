@@ -165,7 +165,7 @@ def test_splat_fails_gradgradcheck_by_that_error(
 
 
 def test_derivatives_of_one_gradient_to_other_inputs_are_refused(session: opencl.Session) -> None:
-    """Gradients of the features alone, and then those of the points they depend on; and through the loss's weights."""
+    """Gradients of the features only, and then those of the points they depend on; and through the loss's weights."""
     arguments = scene(["points_uv", "features"], torch.float32)
     weights = torch.rand(1, 2, 5, 4, requires_grad=True)
     loss = (splat(**arguments)[0] * weights).sum()

@@ -142,7 +142,7 @@ def test_gradient_of_one_output_only(mapped_session: opencl.Session, output: int
 def test_only_the_gradient_asked_for(
     mapped_session: opencl.Session, monkeypatch: pytest.MonkeyPatch, asked: str
 ) -> None:
-    """It is right, and the kernels that compute it are built for it alone."""
+    """It is right, and the kernels that compute it are built for it only."""
     arguments = detached(scene(2, 50, 3))
     arguments[asked].requires_grad_()
     built: list[opencl.Defines] = []

@@ -214,7 +214,7 @@ def test_points_that_are_not_finite_are_absent(mapped_session: opencl.Session, n
 
 @pytest.mark.parametrize("layers", [64, 128, 256, 512])
 def test_a_point_that_is_not_finite_behind_opaque_ones(mapped_session: opencl.Session, layers: int) -> None:
-    """dL/da of the opaque one is f less what lies behind it: that is the point after the next, at any list length."""
+    """dL/da of the opaque one is f minus what lies behind it: that is the point after the next, at any list length."""
     faint, behind = [0.001] * (layers - 1), [0.5] * 9
     features = [*torch.randn(layers).tolist(), math.nan, *range(8)]
     points = pile([*faint, 1.0, *behind], features) | {"backgrounds": torch.ones(1, 1)}

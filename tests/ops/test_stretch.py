@@ -25,7 +25,7 @@ def test_like_reference(mapped_session: opencl.Session, dtype: torch.dtype, size
 
 
 def test_by_hand(mapped_session: opencl.Session, dtype: torch.dtype) -> None:
-    columns = torch.tensor([0.0, 2, 3, 13], dtype=dtype)  # the last one is alone
+    columns = torch.tensor([0.0, 2, 3, 13], dtype=dtype)  # the last one is isolated
     points_uv = torch.stack([columns, torch.zeros(4, dtype=dtype)], dim=1)[None, None]
     factor, opacity = stretch(points_uv, torch.full((1, 1, 4), 0.5, dtype=dtype))
     assert factor.tolist() == [[[4.0, 2.0, 2.0, 1.0]]]

@@ -348,7 +348,7 @@ def test_a_right_camera_with_other_intrinsics() -> None:
 
 def test_a_single_frame_has_no_depth() -> None:
     clip = without(drive(4).clip, "depth", "right")[:1]
-    with pytest.raises(ValueError, match="needs two frames, a right camera or depth, got one frame alone"):
+    with pytest.raises(ValueError, match="needs two frames, a right camera or depth, got only one frame"):
         Perception(clip).raw_depth(0)
 
 

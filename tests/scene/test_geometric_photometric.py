@@ -99,7 +99,7 @@ def test_of_what_can_not_be_measured_nothing_is_said(why: str) -> None:
 
 
 def test_nothing_outside_the_frame_before_counts() -> None:
-    """A velocity by which the box would come from beyond the border is not taken, alike or not."""
+    """A velocity by which the box would come from beyond the border is not taken, similar or not."""
     pair = seen_moving((0.0, 0.0, 0.0))
     dark = pair._replace(image_prev=np.zeros_like(pair.image))
     beyond = np.array([[0.0, 0, 0], [60.0, 0.0, 0.0]])

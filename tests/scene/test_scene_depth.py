@@ -16,7 +16,7 @@ from vestcl.scene.depth.from_motion import motion_depth
 from vestcl.scene.depth.scores import DepthScores
 from vestcl.scene.estimators import OnnxDepth, with_estimates
 
-#: A network's errors that are alike over whole regions: 15 %, up on the left, down on the right.
+#: A network's errors that are the same over whole regions: 15 %, up on the left, down on the right.
 SLOPE = np.linspace(0.85, 1.15, WIDTH)[None, None]
 
 

@@ -36,7 +36,7 @@ def test_movers_are_outvoted() -> None:
 
 
 def test_the_mask_keeps_movers_out() -> None:
-    """Three quarters of the image move alike, and would win."""
+    """Three quarters of the image move in the same way, and would win."""
     correspondence = exact_flow(room(), MOTION)
     elsewhere = exact_flow(room(), turned(0.0, 0.0, 0.0, (0.5, 0.0, 0.0)))
     correspondence.flow_uv[:, :, 80:] = elsewhere.flow_uv[:, :, 80:]

@@ -49,7 +49,7 @@ def test_two_images_are_too_few() -> None:
 
 
 def test_a_lane_line_along_its_own_motion_is_no_bonnet() -> None:
-    """A solid line looks alike in all frames, as bare asphalt does."""
+    """A solid line looks the same in all frames, as bare asphalt does."""
     image = np.full((3, HEIGHT, WIDTH), 0.3, np.float32)
     column = np.arange(WIDTH)[None] - 60 - np.arange(HEIGHT)[:, None]
     image[:, np.abs(column) < 3] = 0.9

@@ -1,4 +1,4 @@
-"""vestcl.scene.flow.parallax: depth against exact flow, what it gains, what it refutes, and what it leaves alone."""
+"""vestcl.scene.flow.parallax: depth against exact flow, gains, refuted depth, and what stays unchanged."""
 
 from typing import Any
 

@@ -184,7 +184,7 @@ class Cloud:
         y, x = (axis.ravel() + 0.5 for axis in np.mgrid[:height, :width])
         self.dx, self.dy = x - uv[:, :1], y - uv[:, 1:]
         sixteenths = (uv % EXACT == 0) & (np.abs(uv) <= EXACT_TO)
-        roundings = np.where(sixteenths, 0, 2 * self.eps * (np.abs(uv) + 64))  # of u less the tile's corner, less 1/2
+        roundings = np.where(sixteenths, 0, 2 * self.eps * (np.abs(uv) + 64))  # of u minus the tile's corner, minus 1/2
         self.dx_error, self.dy_error = roundings[:, :1], roundings[:, 1:]
         self._measure(sixteenths.all(axis=1, keepdims=True))
         self._composite(limit)

@@ -50,7 +50,7 @@ SMALL = change(
 #: The same, predicting RGB directly.
 PAINTING = dataclasses.replace(SMALL, refine=TINY.refine)
 
-#: Every colour shown by its own pixel alone: at rest nothing blurs.
+#: Every colour shown by its own pixel only: at rest nothing blurs.
 SHARP = change(render=RenderConfig(rho=0.95))
 
 ABLATIONS = {

@@ -1,4 +1,4 @@
-"""Small clips for `vestcl prepare`, and the command in this process or in one of its own."""
+"""Small clips for `vestcl prepare`, and the command in this process or in a separate one."""
 
 import json
 import re

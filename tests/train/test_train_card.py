@@ -154,7 +154,7 @@ def test_results_by_hand(text: str) -> None:
     assert "|  | geometric | vest-x | vest-x less geometric, better in |" in text
     assert "| PSNR t+1 | 21.00 [20.00, 22.00] | 22.50 [21.00, 24.00] | +1.50 [+1.00, +2.00], 100% |" in text
     assert "| PSNR t+2 | 17.00 [16.00, 18.00] | 18.50 [17.00, 20.00] | +1.50 [+1.00, +2.00], 100% |" in text
-    assert "| turn t+2 | 0.300 [0.300, 0.300] | 0.200 [0.200, 0.200] | -0.100 [-0.100, -0.100], 100% |" in text
+    assert "| rotation t+2 | 0.300 [0.300, 0.300] | 0.200 [0.200, 0.200] | -0.100 [-0.100, -0.100], 100% |" in text
     assert "t+3 |" not in text and "rival" not in text and "It was reported." in text
     assert "2 windows of 2 clips, seeds 0 to 1, 48 x 160 px" in text
 
@@ -269,7 +269,7 @@ def test_stages_follow_each_other() -> None:
 
 
 def test_curves_are_drawn_of_what_there_is(tmp_path: Path) -> None:
-    """A value that was not finite (null) and one row alone are no reason to fail; curves change the image."""
+    """A value that was not finite (null) and a single row are not an error; curves change the image."""
     rows = log()
     draw_curves(tmp_path / "a.png", rows)
     rows[5] = {**rows[5], "l1": None, "loss": 5.0}

@@ -1,4 +1,4 @@
-"""Processes that are cut short in the middle of a checkpoint: killed, or out of room. What was there before stays."""
+"""Processes that die while writing a checkpoint: killed, or out of disk space. Earlier checkpoints stay."""
 
 import os
 import random

@@ -1,4 +1,4 @@
-"""train.data.windows: batches that follow from (seed, step, position) alone."""
+"""train.data.windows: batches that follow from (seed, step, position) only."""
 
 import pickle
 import subprocess

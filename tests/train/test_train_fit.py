@@ -381,7 +381,7 @@ def test_no_number_is_left_out(broken: None, cache: Path, tmp_path: Path, capsys
 
 
 def fill_disk(monkeypatch: pytest.MonkeyPatch, full: tuple[int, ...]) -> None:
-    """Checkpoints of these steps find no room."""
+    """Checkpoints of these steps find no disk space."""
     save, write, step = checkpoint.save, write_checkpoint, [0]
 
     def saving(out: Path | str, state: checkpoint.TrainingState, keep: int = 3) -> Path:

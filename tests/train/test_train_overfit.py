@@ -17,7 +17,7 @@ from vestcl.prepare.clip import prepare_clip
 
 #: dB that are to be reached, and updates that may be spent, 0.09 s each on one core: 36.2 were measured after 700, from
 #: 26.8.
-#: What is static follows the camera alone, so refinement has to learn most of it.
+#: What is static follows only the camera, so refinement has to learn most of it.
 WANTED, STEPS = 32.0, 400
 
 
@@ -30,7 +30,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_one_window_is_learned(cache: Path, tmp_path: Path) -> None:
-    """24 x 48 px of it, for two cores' sake, from random weights: all four parts learn, from the image alone."""
+    """24 x 48 px of it, for two cores' sake, from random weights: all four parts learn, from the image only."""
     settings = configured(
         cache, tmp_path, model="vest-s",
         data={"crop": [24, 48], "horizons": [1.0], "right": 0.0, "colour": 0.0, "flip": False},

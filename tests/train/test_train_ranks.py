@@ -22,7 +22,8 @@ from vestcl import opencl
 from vestcl.models import config
 
 #: Two processes' weights against one's, relative to how far training has moved them. 6e-8 were measured, for the halves
-#: of a batch of two add up alike; elsewhere rounding may count for more, as Adam divides gradients by their own size.
+#: of a batch of two add up identically; elsewhere rounding may count for more, as Adam divides gradients by their own
+#: size.
 TOLERANCE = 1e-3
 
 
@@ -38,7 +39,7 @@ class Info:
 
 @pytest.fixture(scope="module")
 def one(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run of this process alone."""
+    """The folder of a run of a single process."""
     folder = tmp_path_factory.mktemp("one")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(config, "CONFIGS", MODELS)
@@ -140,7 +141,7 @@ def test_two_processes_reach_the_weights_of_one(one: Path, two: Path, monkeypatc
         assert (shared - single).norm() < TOLERANCE * (single - start).norm(), name
     assert steps(two) == steps(one) == [8, 6, 4, 2]
     rows = read_log(one / LOG), read_log(two / LOG)
-    assert [row["step"] for row in rows[1]] == list(range(1, 9))  # the first process alone writes
+    assert [row["step"] for row in rows[1]] == list(range(1, 9))  # only the first process writes
     for name in ("loss", "l1", "translation", "gradient"):
         assert rows[1][0][name] == pytest.approx(rows[0][0][name], rel=1e-4), name
 

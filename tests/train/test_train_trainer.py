@@ -126,7 +126,7 @@ def test_the_running_mean_by_hand() -> None:
 
 @pytest.mark.parametrize("part", PARTS)
 def test_the_loss_falls_with_each_part_only(part: str, cache: Path, tmp_path: Path) -> None:
-    """L1 alone, on one batch; nothing but the part moves."""
+    """L1 only, on one batch; nothing but the part moves."""
     torch.manual_seed(0)
     changes: dict[str, Any] = {"loss": {"ssim": 0.0, "pose": {}}, "optimiser": {"clip_norm": 1.0}}
     settings = one_stage(cache, tmp_path, stage={"train": [part]}, **changes)

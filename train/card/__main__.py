@@ -66,18 +66,18 @@ class Card:
     out: Path = Path("docs/vest-s")
     """The card's folder; its name is the model's."""
     checkpoint: Path | None = None
-    """The file that is shipped; without it the running mean of the run's last checkpoint."""
+    """The file that is shipped; without it the EMA weights of the run's last checkpoint."""
     horizons: tuple[int, ...] = (1, 3, 5)
     """Steps that tables show, of those that were evaluated."""
     machine: str | None = None
     """What the run was made on; without it what it was evaluated on is listed, marked as such."""
     prepare: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A command that prepared data; may be repeated. Without it they are guessed from the clips."""
+    """A command that prepared data; may be repeated. Default: guessed from the clips."""
 
 
 @interrupt.command
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; what a user can put right is reported in one line, with exit code 2."""
+    """The command; what a user can correct is reported in one line, with exit code 2."""
     options = command_line.parsed(Card, "python -m train.card", __doc__, arguments)
     with warnings_in_lines():
         try:
@@ -138,7 +138,7 @@ def thinned(rows: Sequence[dict[str, Any]], most: int = LOG_ROWS) -> list[dict[s
 
 
 def portable(settings: Any) -> Any:
-    """``settings`` with the last part alone of every absolute path: the folders of one machine are no one else's."""
+    """``settings`` with only the last part of every absolute path: this machine's folders are of no use elsewhere."""
     if isinstance(settings, dict):
         return {key: portable(value) for key, value in settings.items()}
     if isinstance(settings, list):
@@ -236,7 +236,7 @@ def _commands(options: Card, config: Config, weights: Weights, results: Results)
 
 
 def _evaluate_command(saved: dict[str, Any], weights: Weights) -> str:
-    """With what results.json says was set, less what is as it would be anyway."""
+    """With what results.json says was set, without the defaults."""
     name, (height, width) = saved["settings"]["protocol"], saved["settings"]["size"]
     plain = PROTOCOLS[name]
     defaults = {field.name: field.default for field in dataclasses.fields(Evaluation)}

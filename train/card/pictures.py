@@ -29,8 +29,8 @@ SMOOTHED: Final = 0.05
 PANELS: Final[tuple[tuple[str, str, dict[str, float]], ...]] = (
     ("loss", "weighted sum", {"loss": 1}),
     ("image terms, before their weights", "", {"l1": 1, "ssim": 1, "perceptual": 1}),
-    ("camera's turn, error at the target's time", "degrees", {"rotation": 180 / np.pi}),
-    ("camera's path, error at the target's time", "m", {"translation": 1}),
+    ("rotation error at the target's time", "degrees", {"rotation": 180 / np.pi}),
+    ("translation error at the target's time", "m", {"translation": 1}),
 )
 
 #: What a step's seconds are split into.

@@ -252,7 +252,7 @@ def _optimiser(config: Config) -> str:
     optimiser, run = config.optimiser, config.run
     decay = f", weight decay {optimiser.weight_decay:g}" if optimiser.weight_decay else ""
     clip = f", gradient's norm cut at {optimiser.clip_norm:g}" if optimiser.clip_norm else ""
-    mean = f", running mean of the weights with {optimiser.ema:g}" if optimiser.ema else ""
+    mean = f", EMA of the weights with {optimiser.ema:g}" if optimiser.ema else ""
     end = f"cosine to {optimiser.final_factor:g} of the learning rate in each stage"
     return f"Adam, {end}{decay}{clip}{mean}; {run.precision} in encoder and refinement, seed {config.seed}."
 

@@ -366,10 +366,10 @@ def loader(
         workers: processes that read ahead; 0 reads when asked. They open no OpenCL device.
 
     Returns:
-        An iterable of `Batch`, with batch / world windows in each; torch's own generators are left alone.
+        An iterable of `Batch`, with batch / world windows in each; torch's own generators are not used.
 
     Raises:
-        ValueError: a batch that can't be shared out, or no such rank.
+        ValueError: a batch that can't be divided, or no such rank.
     """
     if batch < 1 or batch % world or not 0 <= rank < world:
         raise ValueError(

@@ -149,7 +149,7 @@ def perceptions(
     found = {}
     for depth in depths(clip, protocol, stereo, how.depth_model is not None):
         seen = given(clip, depth)
-        if depth == "clip":  # a frame without depth of its own takes that of its motion, not that of its pair
+        if depth == "clip":  # a frame without its own depth takes that of its motion, not that of its pair
             seen = _without_right(seen)
         inputs = how.inputs(seen)
         found[PAIR * inputs.stereo] = (Perception(seen, inpaint=how.inpainter), inputs)
@@ -179,7 +179,7 @@ def label_of(method: str) -> str:
 
 
 def sentences(by_clip: Mapping[str, Mapping[str, Inputs]]) -> tuple[str, ...]:
-    """On what all methods but the baselines are given besides frames t-1 and t: once, or once for all clips alike.
+    """On what all methods but the baselines are given besides frames t-1 and t: once, or once for all clips.
 
     Args:
         by_clip: the sources by clip and label of rows.

@@ -20,14 +20,14 @@ class Evaluation:
     protocol: tyro.conf.Positional[Name]
     """Which clips, windows, cameras and size."""
     model: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
-    """A model's file, *.safetensors; more than one may be given. Tables call it by the file's stem."""
+    """A model's file, *.safetensors; may be repeated. Tables call it by the file's stem."""
     data: Path | None = None
     """The data set's root, or for `clip` what `vestcl forecast` opens. `street` needs none."""
     prepared: Path | None = None
-    """In place of --data: a folder of clips that `vestcl prepare` wrote at the size that is evaluated, by the names of
+    """Instead of --data: a folder of clips that `vestcl prepare` wrote at the size that is evaluated, by the names of
     the protocol's clips; for `clip` all that it has."""
     out: Path | None = None
-    """Folder for results and for what is done so far; without it out/PROTOCOL."""
+    """Folder for results and for what is done so far; default: out/PROTOCOL."""
     squeeze: Path | None = None
     """SqueezeNet 1.0 weights, for the distance in its features."""
     lpips: tuple[Path, Path] | None = None
@@ -37,27 +37,27 @@ class Evaluation:
     peer: Path | None = None
     """Weights of the learned 2D baseline (`python -m train.peer` writes peer.safetensors)."""
     height: int | None = None
-    """Pixels; without it the protocol's."""
+    """Pixels. Default: the protocol's."""
     width: int | None = None
-    """Pixels; without it the protocol's."""
+    """Pixels. Default: the protocol's."""
     steps: int | None = None
-    """Frames to forecast; without it the protocol's."""
+    """Frames to forecast. Default: the protocol's."""
     horizons: tuple[int, ...] = ()
-    """Steps that tables show; without it the protocol's."""
+    """Steps that tables show. Default: the protocol's."""
     every: int = 1
-    """Take every such window."""
+    """Score only every N-th window."""
     first: int | None = None
-    """The first current frame t of a clip, from 0; without it the protocol's."""
+    """The first current frame t of a clip, from 0. Default: the protocol's."""
     last: int | None = None
     """The last one."""
     mode: Mode | None = None
     """How models make steps after the first: compose the first motion, or feed each forecast frame back (feedback).
-    Without it each as it is meant to: feedback for models that start from rest, compose for vest-s."""
+    Default: feedback for models that start from rest, compose for vest-s."""
     perceive: Perceived | None = None
     """With mode feedback: depth and mask of forecast frames are splatted, or estimated by --depth-model and
-    --mask-model. Without it: estimated where one of these is given, else splatted."""
+    --mask-model. Default: estimated if one of these is given, else splatted."""
     learned: Learned = "tested"
-    """Models that start from what was measured correct the geometric forecast by the learned parts that win a test on
+    """Models that start from measurements correct the geometric forecast by the learned parts that win a test on
     the frames before (tested), as `vestcl forecast` does, or forecast on their own with all parts (all)."""
     depth_model: str | None = None
     """Estimate depth by this checkpoint (a folder, or a name on huggingface.co)."""
@@ -65,7 +65,7 @@ class Evaluation:
     """Estimate classes by this checkpoint (a folder, or a name on huggingface.co)."""
     inpaint: str | None = None
     """How the background behind the foreground is filled: regions, telea ..., or lama:FILE, LaMa's TorchScript export.
-    Without it: regions."""
+    Default: regions."""
     accumulated_depth: bool = False
     """KITTI raw: depth from proj_depth/groundtruth, which has the scans of later frames, too. Tables say so."""
     stereo: bool = False

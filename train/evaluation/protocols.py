@@ -36,7 +36,7 @@ Name = Literal[
     "kitti-prediction", "kitti-space-time", "kitti-space", "kitti-space-val", "cityscapes-prediction", "street", "clip"
 ]  # fmt: skip
 
-#: Streets for evaluation alone: no training, tuning or test may use these seeds.
+#: Streets for evaluation only: no training, tuning or test may use these seeds.
 HELD_OUT: Final = range(1100, 1140)
 
 #: The current frame of a street: two frames before it, as `vestcl bench forecast street: --first 2 --last 2` has.

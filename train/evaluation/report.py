@@ -33,10 +33,10 @@ _BASELINES: Final = (GEOMETRIC, CONSTANT_VELOCITY)
 #: What ends the title of the paper's table.
 _PAPER: Final = ", the paper"
 
-#: Clips of a table per clip; more go to results.json alone.
+#: Clips of a table per clip; more go to results.json only.
 CLIP_ROWS: Final = 60
 
-#: The first of each that there is stands for likeness and for distance where a table has room for no more.
+#: The first available one of each represents likeness and distance where a table has space for no more.
 LIKENESS: Final = ("ms_ssim", "ssim", "psnr")
 DISTANCE: Final = ("lpips", "st_lpips", "squeeze")
 
@@ -100,7 +100,7 @@ def grids(results: EvaluationResults) -> list[Grid]:
 
 
 def short_grids(results: EvaluationResults) -> list[Grid]:
-    """Those that a terminal has room for: by horizon, differences, the paper's."""
+    """Those that a terminal has space for: by horizon, differences, the paper's."""
     name = results.protocol.title
     shown = picture_grids(name, results.records, results.horizons)
     own = [_with_notes(grid, results) for grid in (*shown, *_difference_grids(results))]

@@ -198,13 +198,13 @@ def window(perceptions: Perception | Mapping[str, Perception], truth: Truth, ind
     """Every method's scores on one window.
 
     Args:
-        perceptions: of the truth's clip, by the label of their rows (`perceptions_of`); one alone has no label.
+        perceptions: of the truth's clip, by the label of their rows (`perceptions_of`); a single one has no label.
         truth: of the clip as `prepared` gives it.
         index: the current frame t.
         setup: methods, views and steps.
 
     Returns:
-        A record a view and method, and of `CAMERA` where the clip has poses.
+        A record per view and method, and of `CAMERA` where the clip has poses.
     """
     clip, by_label = truth.clip, {"": perceptions} if isinstance(perceptions, Perception) else perceptions
     views = views_of(clip, setup)

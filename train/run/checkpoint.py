@@ -2,7 +2,7 @@
 
     <out>/checkpoints/step-00001234/    `steps` updates are done
         model.safetensors               weights with their configuration: `Forecaster.load` reads it
-        ema.safetensors                 their running mean, likewise, where there is one
+        ema.safetensors                 their EMA, likewise, where there is one
         state.pt                        the rest, plain containers and tensors: read with ``weights_only=True``
         manifest.json                   format, and size and SHA-256 of each file
 
@@ -78,7 +78,7 @@ class TrainingState:
     model: Mapping[str, torch.Tensor]
     """Weights."""
     ema: Mapping[str, torch.Tensor] | None
-    """Their running mean."""
+    """Their EMA."""
     optimiser: dict[str, Any]
     """Its state dict, as are the scheduler's."""
     scheduler: dict[str, Any]
@@ -241,7 +241,7 @@ def _remove_leftovers(folder: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    """Hidden first, so that it is not seen in part; where that fails, a warning: it costs room, and no run."""
+    """Hidden first, so that it is not seen in part; where that fails, a warning: it costs disk space, not the run."""
     try:
         hidden = path
         if not path.name.startswith("."):

@@ -1,4 +1,4 @@
-"""The processes that train together: started by torchrun, or one alone."""
+"""The processes that train together: started by torchrun, or a single one."""
 
 import gc
 import os

@@ -86,7 +86,7 @@ def model_config(config: Config) -> ModelConfig:
 
 
 class Average:
-    """The running mean of the weights: e <- d e + (1 - d) w; what evaluation uses."""
+    """The EMA of the weights: e <- d e + (1 - d) w; what evaluation uses."""
 
     def __init__(self, model: Forecaster, decay: float) -> None:
         self._mean = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(decay))

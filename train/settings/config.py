@@ -59,7 +59,7 @@ class DataConfig:
     train: tuple[str, ...]
     """Folders that `vestcl prepare` filled; the last part may be a pattern ("streets/seed-*")."""
     weights: tuple[tuple[str, Weight], ...] = ()
-    """[folder as in ``train``, weight] each: how often windows are from it. The sum of weights is taken to be 1, and
+    """[folder as in ``train``, weight] each: how often windows are from it. Weights are normalised to a sum of 1;
     folders that are not listed weigh 0; without any each window is shown as often."""
     crop: tuple[Count, Count] | None = None
     """(height, width) px of a window drawn at random; null shows whole images."""
@@ -68,9 +68,9 @@ class DataConfig:
     flip: bool = True
     """Mirror every other sample."""
     colour: Share = 0.2
-    """Strength of the change of brightness, contrast and saturation, alike in all frames of a sample."""
+    """Strength of the change of brightness, contrast and saturation, the same in all frames of a sample."""
     horizons: tuple[Weight, ...] = (1.0,)
-    """How often the target is t + 1, t + 2, ...: weights, of which the sum is taken to be 1."""
+    """How often the target is t + 1, t + 2, ...: weights, normalised to a sum of 1."""
     right: Share = 0.0
     """Probability that the target is the right camera, of samples that have one."""
     frames: tuple[CountOrNone, Count] | None = None
@@ -106,7 +106,7 @@ class OptimiserConfig:
     clip_norm: Annotated[float, Field(gt=0)] | None = 1.0
     """The gradient's norm over all parameters is cut to this; null cuts nothing."""
     ema: Annotated[float, Field(ge=0, lt=1)] = 0.999
-    """Decay a step of the running mean of the weights, which evaluation uses; 0 keeps none."""
+    """Decay per step of the EMA of the weights, which evaluation uses; 0 keeps none."""
     final_factor: Share = 0.0
     """Where a stage's cosine ends, as a share of the learning rate."""
 
@@ -159,7 +159,7 @@ class Stage:
     steps: Count
     """Updates of the weights."""
     batch: Count = 4
-    """Samples an update, over all processes."""
+    """Samples per update, over all processes."""
     learning_rate: Annotated[float, Field(gt=0, le=1)] = 1e-4
     """After the warm-up; from there it falls along a cosine."""
     warm_up: CountOrNone = 0
@@ -169,9 +169,9 @@ class Stage:
     render: bool = True
     """False leaves out splatting, refinement and all of the loss but the pose's: the cheap way to a camera's motion."""
     crop: tuple[Count, Count] | None = None
-    """In place of the data's."""
+    """Replaces the data's."""
     data: DataConfig | None = None
-    """In place of the run's; in files and overrides, the fields that differ."""
+    """Replaces the run's; in files and overrides, the fields that differ."""
     loss: LossConfig | None = None
     """The same."""
 
@@ -186,7 +186,7 @@ class Stage:
 
 @dataclass(frozen=True, config=RULES)
 class RunConfig:
-    """How the run is carried out: nothing here but ``precision`` and ``on_nan`` changes what is learnt."""
+    """How the run is carried out: nothing here but ``precision`` and ``on_nan`` changes the trained weights."""
 
     checkpoint_every: Count = 500
     """Steps."""
@@ -215,7 +215,7 @@ class Position(NamedTuple):
 
 
 class StageParts:
-    """What stages say of their own; elsewhere the run's counts."""
+    """What stages set themselves; elsewhere the run's counts."""
 
     data: DataConfig
     loss: LossConfig
@@ -239,7 +239,7 @@ class Config(StageParts):
     """Folder of the run: checkpoints, scalars, images."""
     data: DataConfig
     stages: tuple[Stage, ...]
-    """One after the other, each with an optimiser of its own."""
+    """One after the other, each with its own optimiser."""
     loss: LossConfig
     model: str = "vest-s"
     """A name that `vestcl.models.configuration` knows, with its variants ("vest-s+no-omf")."""

@@ -57,7 +57,7 @@ def check_file_options(options: ClipOptions) -> None:
 
 
 def check_folders(options: ClipOptions) -> None:
-    """Refuse folders of depth or label files that are none.
+    """Refuse folders that hold no depth or label files.
 
     Raises:
         ValueError: no such folder, or a file.

@@ -19,7 +19,7 @@ from vestcl.cli import options
 #: Exit status of an error that the user can correct.
 REFUSED: Final = 2
 
-#: What memory that can't be had is called in errors that are no MemoryError: torch's and OpenCL's.
+#: What memory that can't be allocated is called in errors that are not a MemoryError: torch's and OpenCL's.
 _NO_MEMORY: Final = (
     "can't allocate memory",
     "not enough memory",

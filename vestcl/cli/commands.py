@@ -1,4 +1,4 @@
-"""What `vestcl COMMAND --help` lists: a dataclass a command, whose fields are its options.
+"""What `vestcl COMMAND --help` lists: one dataclass per command, whose fields are its options.
 
 Torch and OpenCL are imported late: the help needs neither.
 """
@@ -17,7 +17,7 @@ class Devices:
     """List the OpenCL devices of this machine."""
 
     threads: int | None = None
-    """CPU threads of torch, OpenCV and PoCL. Without it: as many as there are cores."""
+    """CPU threads of torch, OpenCV and PoCL. Default: as many as there are cores."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Doctor:
     timeout: float = 120.0
     """Seconds that a device may take."""
     threads: int | None = None
-    """CPU threads of torch, OpenCV and PoCL. Without it: as many as there are cores."""
+    """CPU threads of torch, OpenCV and PoCL. Default: as many as there are cores."""
 
 
 @dataclass(frozen=True)
@@ -41,31 +41,31 @@ class Demo:
     width: int = 832
     """Pixels."""
     seed: int = 3
-    """Which street."""
+    """Seed of the street."""
     model: str | None = None
-    """vest-s, a .safetensors file, a checkpoint's folder, or geometric. Without it: vest-s, where it is installed."""
+    """vest-s, a .safetensors file, a checkpoint's folder, or geometric. Default: vest-s, where it is installed."""
     quality: Literal["exact", "balanced", "fast"] = "balanced"
-    """How exactly the network computes."""
+    """Inference preset of the network."""
     threads: int | None = None
-    """CPU threads of torch, OpenCV and PoCL. Without it: as many as there are cores."""
+    """CPU threads of torch, OpenCV and PoCL. Default: as many as there are cores."""
     device: str | None = None
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClipOptions:
-    """How a clip is opened, and where depth, classes and the hidden background of its frames come from."""
+    """Options to open a clip, and the sources of depth, classes and inpainted background."""
 
     fov: float | None = None
     """Horizontal field of view in degrees, of a video or a folder without camera.json."""
     depth: Path | None = None
     """Folder of depth files (.png, .exr, .npy) with the frames' names."""
     depth_scale: float | None = None
-    """Their units per metre; PNG needs it (KITTI 256)."""
+    """Units per metre of the depth files; required for PNG (KITTI 256)."""
     labels: Path | None = None
     """Folder of label PNGs with the frames' names."""
     label_ids: Literal["trainIds", "labelIds", "virtual_kitti"] = "trainIds"
-    """What they hold."""
+    """Encoding of the label PNGs."""
     depth_model: str | None = None
     """Estimate depth by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
     huggingface.co."""
@@ -73,20 +73,20 @@ class ClipOptions:
     """Estimate classes by this network: FILE.onnx (described by FILE.json), a checkpoint's folder, or a name on
     huggingface.co."""
     inpaint: str | None = None
-    """How the background behind the foreground is filled: regions, telea ..., or lama:FILE, LaMa's TorchScript export.
-    Without it: regions."""
+    """Inpainting of the background behind the foreground: regions, telea ..., or lama:FILE, LaMa's TorchScript export.
+    Default: regions."""
     rig: str | None = None
     """KITTI: colour or grey cameras."""
     accumulated_depth: bool = False
     """KITTI raw: depth from proj_depth/groundtruth, which has the scans of later frames, too."""
     sequence: str | None = None
-    """KITTI odometry: which one, if there are several."""
+    """KITTI odometry: the sequence, if there are several."""
     snippet: str | None = None
     """Cityscapes: name of the annotated frame, if there are several."""
     variant: str | None = None
     """Virtual KITTI: clone, fog ..., if there are several."""
     threads: int | None = None
-    """CPU threads of torch, OpenCV and PoCL. Without it: as many as there are cores."""
+    """CPU threads of torch, OpenCV and PoCL. Default: as many as there are cores."""
 
 
 @dataclass(frozen=True)
@@ -100,30 +100,30 @@ class Forecast(ClipOptions):
     """A KITTI raw drive, a KITTI odometry sequence, a frame of Cityscapes, a scene of Virtual KITTI 2, a folder with
     camera.json, a video, or street:SEED for a procedural street (street:7?drive=road,fps=25 with bends, at 25 Hz)."""
     out: Path = Path("out")
-    """Folder for the files; those of an earlier forecast are replaced one by one."""
+    """Output folder; files of an earlier forecast are replaced one by one."""
     steps: int = 5
     """Frames to forecast."""
     model: str | None = None
-    """Forecast by a network: vest-s, a .safetensors file, a training checkpoint's folder. Without it: by geometry."""
+    """Forecast by a network: vest-s, a .safetensors file, a training checkpoint's folder. Default: by geometry."""
     mode: Literal["compose", "feedback"] | None = None
-    """With --model: repeat the first step's motion (compose), or see each forecast frame (feedback). Without it: as the
-    model is meant to, which is feedback for models that start from rest, and compose for vest-s."""
+    """With --model: repeat the first step's motion (compose), or feed each forecast frame back (feedback). Default:
+    feedback for models that start from rest, compose for vest-s."""
     perceive: Literal["splatted", "estimated"] | None = None
     """With mode feedback: depth and mask of forecast frames are splatted, or estimated by --depth-model and
-    --mask-model. Without it: estimated where one of these is given, else splatted."""
+    --mask-model. Default: estimated if one of these is given, else splatted."""
     quality: Literal["exact", "balanced", "fast"] | None = None
-    """With --model: balanced (default) is within 0.1 dB of exact in PSNR, fast is not; see docs/time_against_error."""
+    """With --model, the inference preset: balanced (default) is within 0.1 dB of exact in PSNR, fast is not; see
+    docs/time_against_error."""
     learned: Literal["tested", "all"] | None = None
-    """With --model, if it starts from what was measured: correct the geometric forecast by the learned parts that would
-    have improved it at the last frame (tested), or forecast by the network with all of them, untested. Without it:
-    tested."""
+    """With --model, if it starts from measurements: correct the geometric forecast by those learned parts that would
+    have improved it at the last frame (tested), or forecast by the network with all of them (all). Default: tested."""
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Where to look from: source, right, left, or x,y,z[,yaw=][,pitch=][,roll=][,fov=][,name=], as in
-    "0.5,0,0,yaw=-5": metres to the right of, below and ahead of the source camera, and degrees to the right, up and
-    clockwise. Without it: source."""
+    """Target view: source, right, left, or x,y,z[,yaw=][,pitch=][,roll=][,fov=][,name=], as in "0.5,0,0,yaw=-5": metres
+    to the right of, below and ahead of the source camera, and degrees to the right, up and clockwise. May be repeated.
+    Default: source."""
     frame: int | None = None
-    """The current frame t, counted from 0; it and the ones before it are seen. Without it: the last one, or with
-    --compare the last that has STEPS true frames after it."""
+    """The current frame t, from 0; the forecast uses it and earlier frames. Default: the last frame, or with --compare
+    the last one that STEPS true frames follow."""
     compare: bool = False
     """Score forecast and baselines (with --model geometry, too) against the frames that follow in the clip."""
     squeeze: Path | None = None
@@ -131,15 +131,15 @@ class Forecast(ClipOptions):
     st_lpips: StLpipsOption = None
     """With --compare: measure ST-LPIPS, by the weights FILE or those inside an installed stlpips-pytorch."""
     score_size: tuple[int, int] | None = None
-    """With --compare: height and width in pixels that images are scored at; without it the clip's. `vestcl bench
+    """With --compare: height and width in pixels that images are scored at. Default: the clip's. `vestcl bench
     forecast` scores at 256 832."""
     height: int | None = None
-    """Pixels; without it as the clip is, or in proportion to --width."""
+    """Pixels. Default: the clip's, or in proportion to --width."""
     width: int | None = None
-    """Pixels; without it as the clip is, or in proportion to --height."""
+    """Pixels. Default: the clip's, or in proportion to --height."""
     memory: int | None = None
-    """Frames before t-1 whose static scene is shown where frames t and t-1 leave something open; 0 shows none. Of the
-    geometric forecast only. Without it: 3."""
+    """Geometric forecast only: frames before t-1 whose static scene fills what frames t and t-1 do not show; 0: none.
+    Default: 3."""
     gif: bool = False
     """Write an animated GIF of each view, too."""
     exr: bool = True
@@ -179,14 +179,15 @@ class View(ClipOptions):
 class Prepare(ClipOptions):
     """Compute depth, masks, inpainting and motion of clips' frames once, for training, evaluation and forecasts.
 
-    Frames that are there, of the same input, are kept; it may be stopped at any moment, and run twice at once.
+    Frames that are already prepared from the same input are kept. The command may be stopped at any moment, and several
+    may run at once.
     """
 
     inputs: tyro.conf.Positional[tuple[str, ...]]
     """Clips, as `vestcl forecast` opens them, or procedural streets: street:SEED, street:FIRST-LAST, with
     options or without: street:7?drive=road,fps=12.5,depth=stereo,masks=motion."""
     out: Path | None = None
-    """Folder of the cache; a folder in it for each clip. Without it: .vestcl in each input."""
+    """Folder of the cache, with one folder per clip. Default: .vestcl in each input."""
     height: int = 256
     """Pixels."""
     width: int = 832
@@ -196,17 +197,17 @@ class Prepare(ClipOptions):
     samples: int = 2
     """Streets' colour is the mean over samples x samples rays per pixel."""
     drive: Literal["usual", "random", "road"] = "usual"
-    """How cameras drive down streets: as the street has it; the same, but drawn at random in the ranges of real cars,
-    from a random time on; or with bends, braking, stops and a body on springs. This and the next three are for streets
-    whose input does not list them itself."""
+    """How cameras drive: usual, the street's own drive; random, drawn in the ranges of real cars, from a random time
+    on; or road, with bends, braking, stops and a body on springs. This and the next three options apply to streets
+    whose input does not set them."""
     street_depth: Literal["true", "stereo", "motion", "scan", "random"] = "true"
-    """Where streets' depth comes from: the street itself, or as on the road the matching of its stereo pairs, the
-    camera's motion, or simulated laser scans; random draws one of the latter three for each street."""
+    """Source of streets' depth: the true depth, matching of stereo pairs, the camera's motion, or simulated laser
+    scans; random draws one of the latter three for each street."""
     street_masks: Literal["true", "motion", "disturbed", "random"] = "true"
-    """Where streets' masks come from: true labels, motion, or labels with a classifier's errors; random draws one of
-    the latter two for each street."""
+    """Source of streets' masks: true labels, motion, or labels with a classifier's errors; random draws one of the
+    latter two for each street."""
     street_fps: str | None = None
-    """Frames per second of streets, or random: 8 to 30. Without it 10."""
+    """Frames per second of streets, or random: 8 to 30. Default: 10."""
     shard: str | None = None
     """I/N, I from 0: every N-th clip from the I-th on. Default: torchrun's RANK and WORLD_SIZE, if set."""
     workers: int = 1
@@ -215,4 +216,4 @@ class Prepare(ClipOptions):
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure a part of vestcl, `vestcl bench splat` for one; `vestcl bench --help` lists all."""
+    """Measure a part of vestcl, such as `vestcl bench splat`; `vestcl bench --help` lists all."""

@@ -43,7 +43,7 @@ CONTEXT, FPS = 4, 10.0
 #: Seconds into the drive: an oncoming car is near.
 START: Final = 0.7
 
-#: Rays per pixel and direction: images as a camera's, without jagged edges.
+#: Rays per pixel and direction: antialiased images, as from a camera.
 SAMPLES: Final = 2
 
 #: The source camera, the rig's right one, and one that no car has: next to it, higher up, turned to the left.
@@ -67,7 +67,7 @@ def run(
     level: quality.Quality = quality.USUAL,
     steps: int = 5,
 ) -> None:
-    """Forecast one street from three cameras, compare with what then happens there, and write it all.
+    """Forecast one street from three cameras, compare with what then happens there, and write everything.
 
     Args:
         out: folder for forecast.json, a folder of images, video and OpenEXR per view, and sheet.png; made if missing.
@@ -76,7 +76,7 @@ def run(
         seed: of the street.
         model: NETWORK or any other that `Forecaster.from_pretrained` knows, or GEOMETRIC; None is
             NETWORK where this installation has it, else GEOMETRIC.
-        level: how exactly the network computes.
+        level: the inference preset.
         steps: frames to forecast.
 
     Raises:

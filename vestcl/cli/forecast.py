@@ -1,4 +1,4 @@
-"""What `vestcl forecast` does: open a clip, forecast it, compare it with the truth, write it all, and say so."""
+"""What `vestcl forecast` does: open a clip, forecast it, compare it with the truth, write and report the results."""
 
 import contextlib
 import dataclasses
@@ -189,7 +189,7 @@ def _forecast(
 
 
 def _beside(comparison: Comparison, rival: Comparison, method: str) -> Comparison:
-    """The comparison with another's forecast as a method more, right after its own."""
+    """The comparison with another's forecast as an additional method, right after its own."""
     own = compare.FORECAST
     images = {own: comparison.images[own], method: rival.images[own], **comparison.images}
     scores = {own: comparison.scores[own], method: rival.scores[own], **comparison.scores}
@@ -294,7 +294,7 @@ def _print_end(console: Console, saved: forecast_files.SavedForecast) -> None:
 
 
 def _paths(view: dict[str, Any]) -> Iterator[Path]:
-    """The images as first ... last, then the files that there is one of."""
+    """The images as first ... last, then the single files."""
     for kind in ("image", "exr"):
         files = [Path(frame[kind]) for frame in view["frames"] if kind in frame]
         if files:

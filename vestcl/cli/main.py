@@ -146,7 +146,7 @@ def _benches(names: Sequence[str], asked: bool) -> dict[str, tuple[ModuleType, t
 
 
 def _bench_of(name: str, asked: bool) -> tuple[ModuleType, type] | None:
-    """None where there is none of that name; one that nobody asked for and that is broken is a warning, no error."""
+    """None where there is none of that name; a broken one that was not asked for is a warning, not an error."""
     path = f"vestcl.bench.{_BENCHES[name]}"
     try:
         module = import_module(path)

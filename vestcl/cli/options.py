@@ -1,4 +1,4 @@
-"""What options may be, in every command of vestcl and train alike, and how messages call them: as they are typed."""
+"""What options may be, in every command of vestcl and train, and how messages name them: as they are typed."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ from typing import Any, Final
 LARGEST_SIDE: Final = 16384
 MOST_PIXELS: Final = 1 << 25
 
-#: Whole numbers without a range of their own: what NumPy and kernels hold.
+#: Integers without a range: what NumPy and kernels hold.
 _WHOLE: Final = 2**63 - 1
 
 

@@ -1,4 +1,4 @@
-"""What every reader gives: a clip of samples, one per frame, all typed and measured alike.
+"""What every reader gives: a clip of samples, one per frame, all with the same types and units.
 
 A sample holds no pixels: it knows where they are and reads them when asked, at the sample's own size. So a drive of
 thousands of frames opens at once, and `Sample.resized` costs nothing but a K.

@@ -166,7 +166,7 @@ def ego_motion_error(dst_from_src: torch.Tensor, truth: torch.Tensor) -> EgoMoti
     """
     check(dst_from_src=(dst_from_src, "B 4 4"), truth=(truth, "B 4 4"))
     rotation = truth[:, :3, :3].mT @ dst_from_src[:, :3, :3]
-    # The arc cosine of the trace alone has no digits left near zero; the sine gives them.
+    # The arc cosine of the trace by itself has no digits left near zero; the sine gives them.
     axis = torch.stack([rotation[:, i, j] - rotation[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
     trace = rotation.diagonal(dim1=1, dim2=2).sum(dim=-1)
     angle = torch.atan2(torch.linalg.vector_norm(axis, dim=-1), trace - 1)

@@ -105,7 +105,7 @@ class Lpips(_LearntDistance):
 class StLpips(_LearntDistance):
     """ST-LPIPS: LPIPS's formula over the shift-tolerant AlexNet's maps, with weights and heads of its own.
 
-    It hardly sees a shift of the whole image by a pixel. It is a metric of its own: not LPIPS, and not comparable with
+    It hardly sees a shift of the whole image by a pixel. It is a separate metric: not LPIPS, and not comparable with
     LPIPS's figures.
 
     Args:

@@ -191,7 +191,7 @@ def look(
 def predictions(truth: Truth, index: int, steps: int, views: Sequence[View], forecasts: Forecasts) -> Predictions:
     """What the baselines and ``forecasts`` show of one window.
 
-    The baselines see the source camera alone, as the forecasts do, and are compared with every view. Of another view
+    The baselines see only the source camera, as the forecasts do, and are compared with every view. Of another view
     optical flow is shown once more with that camera's own past, which no forecast from the source camera has.
 
     Args:
@@ -245,7 +245,7 @@ def score(
         report: is given the share of the steps that are done, 0 to 1.
 
     Returns:
-        A record a view and method.
+        A record per view and method.
     """
     scores: dict[tuple[str, str], dict[str, list[float]]] = {}
     known: dict[int, Look] = {}

@@ -4,7 +4,7 @@ Neighbouring windows of a clip show the same objects, so clips are what is drawn
 
     x* = sum_c n_c S_c / sum_c n_c N_c
 
-with S_c the sum over a clip's windows, N_c their number, and n_c how often c was drawn. Where there is one clip alone
+with S_c the sum over a clip's windows, N_c their number, and n_c how often c was drawn. Where there is only one clip,
 its windows are drawn instead; the interval is then too narrow.
 """
 
@@ -82,7 +82,7 @@ def intervals(records: Sequence[Record]) -> dict[str, list[Interval]]:
 
 
 def interval_grid(title: str, records: Sequence[Record], horizons: Sequence[int], metrics: Sequence[str]) -> Grid:
-    """A table of `intervals`: a row per method, for each metric a column a horizon.
+    """A table of `intervals`: a row per method, for each metric a column per horizon.
 
     Args:
         title: of the table.
@@ -113,7 +113,7 @@ def drawn(records: Sequence[Record]) -> str:
 
 
 def differences(records: Sequence[Record], baseline: Sequence[Record]) -> dict[str, list[Difference]]:
-    """Paired: of each window the score less the baseline's, by metric and step.
+    """Paired: of each window the score minus the baseline's, by metric and step.
 
     Args:
         records: of one view and method.

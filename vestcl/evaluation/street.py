@@ -93,7 +93,7 @@ def splatter_alone(clip: Clip, index: int) -> dict[str, list[float]]:
         index: the frame t.
 
     Returns:
-        "splatted_db", "warped_db", "splatter_loss_db" (the second less the first) and "seen", the pixels' share; one
+        "splatted_db", "warped_db", "splatter_loss_db" (the second minus the first) and "seen", the pixels' share; one
         number each.
 
     Raises:

@@ -41,8 +41,10 @@ METRICS: Final = {
     "psnr_seen": Metric(
         "PSNR*", ".2f", +1, "PSNR*: over the pixels that the geometric forecast covers by half or more."
     ),
-    "rotation_deg": Metric("turn", ".3f", -1, "turn: error of the camera's turn since t, degrees."),
-    "translation_percent": Metric("path", ".2f", -1, "path: error of the camera's path since t, % of its length."),
+    "rotation_deg": Metric("rotation", ".3f", -1, "rotation: error of the camera's rotation since t, degrees."),
+    "translation_percent": Metric(
+        "translation", ".2f", -1, "translation: error of the camera's translation since t, % of its length."
+    ),
 }
 
 
@@ -92,7 +94,7 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
 
 
 def picture_grids(name: str, records: Sequence[Record], horizons: Sequence[int], running: bool = False) -> list[Grid]:
-    """A table per view: a row per method, for each metric a column a horizon.
+    """A table per view: a row per method, for each metric a column per horizon.
 
     Args:
         name: what the windows are of.
@@ -180,7 +182,7 @@ def number(value: float, digits: str) -> str:
 def _notes(view: str, shown: Sequence[str]) -> tuple[str, ...]:
     notes = ["s: seconds per window, on this machine.", *(METRICS[m].note for m in shown if METRICS[m].note)]
     if view == RIGHT:
-        notes.append("Forecasts see the source camera alone; an oracle sees what the right camera saw before.")
+        notes.append("Forecasts see the source camera only; an oracle sees what the right camera saw before.")
     return tuple(notes)
 
 

@@ -43,7 +43,7 @@ def open(
         source: a KITTI raw drive, a KITTI odometry sequence, a frame of Cityscapes, a scene of Virtual KITTI 2, a
             folder with camera.json, a video, or "street:SEED" for a procedural street, which needs no file.
         height: px; None is as the clip is, or in proportion to ``width``.
-        width: px, alike.
+        width: px, likewise.
         frames: of a street, STREET_FRAMES if not given.
         **options: of the reader, as `vestcl forecast` has them: ``fov`` (degrees) of a video, ``depth``, ``labels``,
             ``rig``, ``sequence`` ... (`vestcl.data.open.open_sequence`).
@@ -123,7 +123,7 @@ def _cameras(views: str | Iterable[str | View], clip: Clip, index: int) -> list[
     found = [view if isinstance(view, View) else next(parsed) for view in given]
     names = [view.name for view in found]
     if len(set(names)) < len(names):
-        raise ValueError(f"`views` must have a name of their own each, got {', '.join(names)}")
+        raise ValueError(f"`views` must have different names, got {', '.join(names)}")
     return found
 
 

@@ -169,7 +169,7 @@ def read_forecast(out: str | Path) -> SavedForecast:
     """What `write_forecast` wrote to the folder ``out``.
 
     Raises:
-        ValueError: no forecast.json there (none, or one that was not finished), or it is none of ours.
+        ValueError: no forecast.json there (none, or one that was not finished), or it was not written by vestcl.
     """
     path = Path(out) / JSON
     try:

@@ -83,7 +83,7 @@ def forecast_frames(
         coverage 1.
 
     Raises:
-        ValueError: no such frame or none before it, no steps or views, or a clip that depth can't be had for.
+        ValueError: no such frame or none before it, no steps or views, or a clip without a source of depth.
     """
     clip = perception.clip
     if not 1 <= index < len(clip):

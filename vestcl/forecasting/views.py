@@ -54,7 +54,7 @@ def parse_view(text: str, camera: Clip | Sample) -> View:
         The view, at the size of ``camera``.
 
     Raises:
-        ValueError: another word, a number that is none, an angle or name out of range, or a clip without a right
+        ValueError: another word, an invalid number, an angle or name out of range, or a clip without a right
             camera; the message says what is expected.
     """
     sample = camera if isinstance(camera, Sample) else camera[0]
@@ -82,7 +82,7 @@ def parse_views(texts: Iterable[str], camera: Clip | Sample) -> list[View]:
     views = [parse_view(text, camera) for text in texts]
     names = [view.name for view in views]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"`view` must have a name of its own each, got {', '.join(twice)} twice; add name=...")
+        raise ValueError(f"`view` must have different names, got {', '.join(twice)} twice; add name=...")
     return views
 
 

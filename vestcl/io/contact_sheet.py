@@ -146,7 +146,7 @@ def scale_bar(width: int, low: str, high: str, colours: str = ERROR_COLOURS) -> 
         [height, width, 3] on PAPER.
 
     Raises:
-        ValueError: no room for the strip between the words, or no such colour map.
+        ValueError: no space for the strip between the words, or no such colour map.
     """
     if colours not in matplotlib.colormaps:
         raise ValueError(f"`colours` must be a colour map of matplotlib's, got {colours!r}")

@@ -4,14 +4,14 @@
     vest-s                  widths that two CPU cores train
     +fixed-depth            ablation A of the paper: every pixel at FIXED_DEPTH; +fixed-depth=35 puts it at 35 m
     +no-emf  +no-omf        ablations B and C: without ego-motion (object motion moves all), without object motion
-    +colour                 colour, coverage and inverse depth are rendered, too: 37 channels a side in place of 32
+    +colour                 colour, coverage and inverse depth are rendered, too: 37 channels per side in place of 32
     +features-only          the features and nothing else are rendered, as vest-paper does
     +joint                  both clouds splatted together in one depth-ordered pass
     +residual               refinement adds to the splatted colour instead of predicting RGB directly
     +filled                 it adds to that colour divided by coverage, holes filled from what surrounds them
     +painting               it predicts RGB directly
-    +from-rest              motion starts from rest, not from what was measured
-    +from-prior             motion starts from what was measured: see `MotionPrior`
+    +from-rest              motion starts from rest, not from measurements
+    +from-prior             motion starts from measurements: see `MotionPrior`
     +feedback  +compose     how later frames are forecast by default; without them as `ModelConfig.mode` says
     +omf-paper  +omf-dmvfn  the two published shapes of object motion
     +omf-inpainted          object motion sees the inpainted layers, too
@@ -34,14 +34,14 @@ Mode = Literal["feedback", "compose"]
 
 #: Depth goes into the networks as log(metres), clamped from below where the splatter stops drawing ...
 LOG_DEPTH_NEAR: Final = constants.NEAR
-#: ... and from above where, for a car's camera, everything is equally far: 1 km moves less than a pixel a frame.
+#: ... and from above where, for a car's camera, everything is equally far: 1 km moves less than a pixel per frame.
 LOG_DEPTH_FAR: Final = 1000.0
 
 #: Depth of every pixel in the ablation "fixed depth", metres, where the variant gives none: about the median of a
 #: street seen from a car. The paper takes the best one, so search: +fixed-depth=10, =20, =40 ...
 FIXED_DEPTH: Final = 20.0
 
-#: Channels a group of GroupNorm: encoder (of 1 to 64 that its authors tried on ImageNet, 16 were the best) ...
+#: Channels per group of GroupNorm: encoder (of 1 to 64 that its authors tried on ImageNet, 16 were the best) ...
 ENCODER_GROUP: Final = 16
 #: ... and refinement (as in 3D Moments).
 REFINE_GROUP: Final = 32
@@ -49,7 +49,7 @@ REFINE_GROUP: Final = 32
 #: The footprint's radius in source pixels (3D Moments): for features that a network then refines.
 RHO: Final = 1.5
 
-#: A pixel that is covered by less has no depth of its own: one footprint's outermost tenth alone is on it.
+#: A pixel that is covered by less has no depth: only one footprint's outermost tenth is on it.
 LEAST_COVERAGE: Final = 0.1
 
 #: From this coverage on a side hides what is behind it: only cracks between a surface's points let it through.
@@ -78,7 +78,7 @@ class EncoderConfig:
     features: int = 32
     """Channels out."""
     background: Literal["own", "frame"] = "own"
-    """"own": the inpainted background is an image of its own. "frame": it is normalised by its frame's statistics, and
+    """"own": the inpainted background is a separate image. "frame": it is normalised by its frame's statistics, and
     where it is the frame itself, so are its features: then it need only be encoded where they differ."""
 
 
@@ -143,7 +143,7 @@ class ObjectMotionConfig:
         if self.shape not in ("paper", "dmvfn"):
             raise ValueError(f'`shape` must be "paper" or "dmvfn", got {self.shape!r}')
         if not self.scales or len(self.scales) != len(self.widths):
-            raise ValueError(f"`scales` and `widths` must be as long, got {self.scales} and {self.widths}")
+            raise ValueError(f"`scales` and `widths` must have equal length, got {self.scales} and {self.widths}")
         if min(self.scales) < 1 or any(width % 4 or width < 4 for width in self.widths):
             raise ValueError(f"`scales` must be >= 1, `widths` multiples of 4, got {self.scales} and {self.widths}")
         if self.routing and not 0 < self.routing.budget < len(self.scales):
@@ -173,7 +173,7 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         if self.inpainted == "inner" and (self.previous != "uncovered" or self.joint):
-            raise ValueError('`inpainted` may be "inner" with `previous` "uncovered" alone, and not with `joint`')
+            raise ValueError('`inpainted` may be "inner" with `previous` "uncovered" only, and not with `joint`')
 
     def side_channels(self, features: int) -> int:
         """Channels of one rendered image: features, and then colour 3, coverage 1, inverse depth 1 (1/m)."""
@@ -195,7 +195,7 @@ class RefineConfig:
     """Channels at H/2, H/4, ...; the bottleneck has the last."""
     base: Literal["none", "splatted", "filled"] = "none"
     """What refinement adds to: coverage x splatted colour; or that colour divided by coverage and, where nothing
-    covers, filled from what surrounds it. "none" paints the image through a sigmoid."""
+    covers, filled from what surrounds it. "none" predicts RGB directly through a sigmoid."""
     refines: Literal["clouds", "forecast"] = "clouds"
     """"clouds": the splatted clouds, features among them. "forecast": planes of a geometric forecast
     (`vestcl.forecasting.network.planes`), whose image it adds to; the network's own forecast is then its base,

@@ -124,7 +124,7 @@ class Forecaster(
             K: [B, 3, 3] px, of both.
             steps: number of future frames.
             views: the cameras to show, as (tgt_from_next [B, 4, 4], K [B, 3, 3]), each at its own future time; None
-                is the source camera alone; none at all forecasts motion, with "compose" alone.
+                is the source camera only; none at all forecasts motion, with "compose" only.
             mode: "feedback" takes each forecast frame, as the source camera sees it, for an input of the next step;
                 no gradient passes from step to step. "compose" encodes nothing again: the camera continues as was
                 forecast at t, and repeats its last motion beyond that; objects repeat their motion in the world. None
@@ -268,7 +268,7 @@ class Forecaster(
                 return cls.load(hf_hub_download(name, WEIGHTS, **options))
             except (HfHubHTTPError, EntryNotFoundError, OSError) as error:
                 reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-                raise ValueError(f"{name}: is not a file here, and can't be had from the hub: {reason}") from error
+                raise ValueError(f"{name}: is not a file here, and not available on the hub: {reason}") from error
         return cls.load(find_model(name))
 
     def _save_pretrained(self, save_directory: Path) -> None:

@@ -7,10 +7,10 @@ from typing import Final
 #: What this version ships with, each NAME as FOLDER/NAME.safetensors.
 SHIPPED: Final = ("vest-s",)
 
-#: In a wheel, an editable install and a bare checkout alike.
+#: In a wheel, an editable install and a bare checkout.
 FOLDER: Final = Path(__file__).resolve().parents[1] / "weights"
 
-#: What of a training checkpoint's folder is taken, the first that is there: the running mean forecasts better.
+#: What of a training checkpoint's folder is taken, the first that is there: the EMA weights forecast better.
 _OF_A_CHECKPOINT: Final = ("ema.safetensors", "model.safetensors")
 
 

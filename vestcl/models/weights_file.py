@@ -97,7 +97,7 @@ def _read_torch(path: Path) -> Any:
             return torch.load(file, map_location="cpu", weights_only=True)
         except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, KeyError, ValueError) as error:
             reason = str(error).partition("\n")[0]
-            raise ValueError(f"`path` must be a PyTorch file of tensors alone, got {path} ({reason})") from error
+            raise ValueError(f"`path` must be a PyTorch file that holds only tensors, got {path} ({reason})") from error
 
 
 def _read_safetensors(path: Path) -> dict[str, torch.Tensor]:

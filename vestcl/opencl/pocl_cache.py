@@ -27,7 +27,7 @@ NEEDED: Final = 32 << 20
 #: Bytes that must be free for one program more.
 _NEEDED_FOR_ONE: Final = 4 << 20
 
-#: The longest path that PoCL takes, less what it adds.
+#: The longest path that PoCL takes, minus what it adds.
 _LONGEST: Final = 800
 
 #: Errors of a file system that can be written, but can't reserve space.
@@ -64,7 +64,7 @@ def wrappers_cache_fault() -> str:
 
 
 def fault(folder: Path, needed: int = NEEDED) -> str:
-    """Why ``folder`` can't be a cache with room for ``needed`` bytes, or nothing. The folder is made."""
+    """Why ``folder`` can't be a cache with space for ``needed`` bytes, or nothing. The folder is made."""
     if not folder.parts or len(os.fsencode(folder)) > _LONGEST:
         return "its path is too long" if folder.parts else "its path is empty"
     try:

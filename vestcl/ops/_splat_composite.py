@@ -215,7 +215,7 @@ def _tiles_backward_inputs(
     """The strides of the image's gradient, and what the backward by tiles reads, and scratch memory for checkpoints."""
     lists = layer.lists
     strides, grad_image = _strides(lists.session, grad_image)
-    # A segment but the last has room for less than one more footprint, which bounds their number.
+    # A segment but the last has space for less than one more footprint, which bounds their number.
     segments = 1 + lists.tile_scratch // (constants.SEGMENT - _GROUP)
     checkpoint_starts = (np.cumsum(segments) - segments).astype(np.int32)
     checkpoints = int(segments.sum()) if segments.max(initial=1) > 1 else 1

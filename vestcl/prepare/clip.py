@@ -82,7 +82,7 @@ def prepare_clip(
 
     Args:
         clip: at the size wanted, two frames or more.
-        folder: for this clip alone.
+        folder: for this clip only.
         inputs: where depth, masks, camera motion and inpainting come from, for clip.json; None reads it off the clip.
         perceived: the same frames as perception sees them; None is ``clip``. Without right cameras depth is not
             matched against the right images, which ``clip`` has as targets.
@@ -173,7 +173,7 @@ def _remove(path: Path) -> None:
 
 @contextlib.contextmanager
 def _locked(folder: Path, wait: bool) -> Iterator[bool]:
-    """Yields whether this process alone may write to the folder."""
+    """Yields whether only this process may write to the folder."""
     lock = folder / _LOCK
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Clips prepared one after the other, here or in processes of their own. One clip's failure stops no other."""
+"""Clips prepared one after the other, here or in separate processes. One clip's failure stops no other."""
 
 import multiprocessing
 import os
@@ -90,7 +90,7 @@ def _run_here(tasks: Sequence[Task], work: Work, summary: Summary, advance: Adva
 
 
 def _run_apart(tasks: Sequence[Task], work: Work, summary: Summary, advance: Advance, workers: int) -> None:
-    """The same in processes of their own."""
+    """The same in separate processes."""
     spawn = multiprocessing.get_context("spawn")
     frames: multiprocessing.Queue[bool] = spawn.Queue()
     others = set(multiprocessing.active_children())

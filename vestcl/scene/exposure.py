@@ -72,7 +72,7 @@ def curve_by_flow(image_prev: Array, image: Array, flow_uv: Array) -> ToneCurve:
 
     Args:
         image_prev: [3, H, W] RGB in [0, 1].
-        image: [3, H, W] alike.
+        image: [3, H, W] likewise.
         flow_uv: [2, H, W] px, from ``image`` to ``image_prev``.
     """
     grid = np.s_[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
@@ -97,7 +97,7 @@ def as_exposed(image_prev: Array, image: Array, flow_uv: Array) -> Array:
 
     Args:
         image_prev: [3, H, W] RGB in [0, 1].
-        image: [3, H, W] alike.
+        image: [3, H, W] likewise.
         flow_uv: [2, H, W] px, from ``image`` to ``image_prev``.
 
     Returns:
@@ -114,7 +114,7 @@ def matched_for_flow(dst: Array, src: Array, flow_uv: Array) -> Array:
 
     Args:
         dst: [3, H, W] RGB in [0, 1].
-        src: [3, H, W] alike.
+        src: [3, H, W] likewise.
         flow_uv: [2, H, W] px, a first estimate from ``src`` to ``dst``.
     """
     if (curve_by_flow(dst, src, flow_uv).gains == 1).all():

@@ -76,7 +76,7 @@ class Measurements(KeptResults):
     def motions(self, indices: Sequence[int]) -> list[NDArray[np.float64]]:
         """`prev_from_cur` of consecutive frames, all in the scale of the last one where depth comes from motion.
 
-        There each frame's road gives it a scale of its own; parallax over three images gives the ratio of their speeds.
+        There each frame's road gives it its own scale; parallax over three images gives the ratio of their speeds.
         Where it does not, as in the first moment of a drive, the motion before is taken to be as fast.
 
         Args:
@@ -221,7 +221,7 @@ class Measurements(KeptResults):
 
     def _from_motion(self, index: int) -> MotionDepth:
         if len(self.clip) < 2:
-            raise ValueError(f"{self.clip.name}: needs two frames, a right camera or depth, got one frame alone")
+            raise ValueError(f"{self.clip.name}: needs two frames, a right camera or depth, got only one frame")
         if index == 0:  # nothing is before it, so what comes after has to do
             return self.once("motion depth", 0, lambda: motion_depth([self.image(1), self.image(0)], self.clip[0].K))
         if self.is_lost(index):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 #: Images are compared at that width, px, where noise is averaged out, and in that share of the height from below.
 _WIDTH, _LOWER = 416, 0.2
 
-#: Pairs of frames that are compared at least: asphalt may look alike in two.
+#: Pairs of frames that are compared at least: asphalt may look the same in two.
 PAIRS: Final = 2
 
 #: An edge, grey levels (0 to 1) per pixel, is static if it seems to move by less than this many pixels across itself.

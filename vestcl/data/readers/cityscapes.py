@@ -155,7 +155,7 @@ def _below(path: Path) -> Iterator[tuple[Path, str]]:
     top = path / _FRAMES if (path / _FRAMES).is_dir() else path
     if _FRAMES not in top.parts:
         return
-    levels = 2 - top.parts[::-1].index(_FRAMES)  # SPLIT and CITY, less what the path already has
+    levels = 2 - top.parts[::-1].index(_FRAMES)  # SPLIT and CITY, without what the path already has
     cities = sorted(top.glob("/".join(["*"] * levels))) if levels > 0 else [top]
     for city in cities:
         cameras = city.parents[2] / "camera" / city.parent.name / city.name

@@ -138,7 +138,7 @@ def _labels(folder: Path, names: list[str], about: CameraFile) -> dict[str, Labe
 
 
 def _rights(folder: Path, names: list[str], about: CameraFile, left_size: tuple[int, int]) -> dict[str, RightCamera]:
-    """By frame. Without numbers of its own it is as the left camera, whose images may have another size."""
+    """By frame. Without its own numbers it is as the left camera, whose images may have another size."""
     found = files.next_to(folder / "right", names, files.IMAGE_SUFFIXES)
     if not found:
         return {}

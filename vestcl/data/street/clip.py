@@ -114,7 +114,7 @@ def street_clip(
         street: where.
         frames: how many, 1 or more.
         height: of the images, px.
-        width: alike.
+        width: likewise.
         start: seconds.
         fps: frames per second.
         baseline: metres from the left camera to the right one.

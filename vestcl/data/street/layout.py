@@ -1,7 +1,7 @@
 """Static and dynamic objects along the procedural street, and where.
 
 The street is built in blocks of BLOCK metres, each from the seed and its own index, so that any stretch of it can be
-built alone; moving cars and pedestrians go in endless files, see vestcl/data/street/driving/traffic.py.
+built separately; moving cars and pedestrians go in endless files, see vestcl/data/street/driving/traffic.py.
 """
 
 import functools
@@ -64,7 +64,7 @@ class File:
 
 
 def _rng(seed: int, purpose: int, index: int) -> np.random.Generator:
-    """A generator of its own for item ``index``, of either sign, of ``purpose``."""
+    """A separate generator for item ``index``, of either sign, of ``purpose``."""
     return np.random.default_rng([seed, purpose, 2 * abs(index) + (index < 0)])
 
 

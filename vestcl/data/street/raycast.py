@@ -256,7 +256,7 @@ def _view(
     view["sun"] = scene.sun
     view["pixel"] = 1 / (K[0, 0] * max(samples, 1))
     view["lane"], view["kerb"] = scene.lane, scene.kerb
-    # The grid starts at a multiple of a cell in the world, lest shadows depend on where the camera is.
+    # The grid starts at a multiple of a cell in the world, so that shadows do not depend on where the camera is.
     view["grid"] = -SHADOW_REACH - np.mod(view["camera"][0, [0, 2]], SHADOW_CELL)
     view["seed"] = scene.seed
     return view

@@ -155,7 +155,7 @@ def load_trunk(name: str, path: Path | str, normalisation: Normalisation | None 
         normalisation: what the weights expect; None is CAFFE for an ``.npz`` and IMAGENET for the others.
 
     Returns:
-        The trunk; gradients flow through it to the image alone.
+        The trunk; gradients flow through it to the image only.
 
     Raises:
         FileNotFoundError: no such file; the message says how to make it.

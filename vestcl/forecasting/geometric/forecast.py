@@ -42,7 +42,7 @@ def forecast_clip(
     memory: int = MEMORY,
     progress: Progress | None = None,
 ) -> Forecast:
-    """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` alone.
+    """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` only.
 
     Args:
         clip: at its own size; its later frames and poses are not looked at.
@@ -57,7 +57,7 @@ def forecast_clip(
         The forecast, of the clip's height and width.
 
     Raises:
-        ValueError: no such frame or none before it, no steps, no views, or a clip that depth can't be had for.
+        ValueError: no such frame or none before it, no steps, no views, or a clip without a source of depth.
     """
     done, total = [0.0], _stages(index, memory) + steps * len(views)
 
@@ -155,7 +155,7 @@ def show_frame(
         By the views' names.
 
     Raises:
-        ValueError: a clip that depth can't be had for.
+        ValueError: a clip without a source of depth.
     """
     clip = perception.clip
     remembered, paths = remember(perception, index, memory), Paths(perception.frame(index))

@@ -42,7 +42,7 @@ def forecast_clip(
     learned: Learned = "tested",
     progress: Progress | None = None,
 ) -> Forecast:
-    """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` alone.
+    """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` only.
 
     Args:
         clip: at its own size; its later frames and poses are not looked at.
@@ -60,7 +60,7 @@ def forecast_clip(
         The forecast, of the clip's height and width.
 
     Raises:
-        ValueError: no such frame or none before it, no steps, no views, or a clip that depth can't be had for.
+        ValueError: no such frame or none before it, no steps, no views, or a clip without a source of depth.
     """
     composed = _is_composed(model.config, mode, learned)
     done, total = [0], _STAGES + (steps * len(views) if composed else 0)
@@ -88,7 +88,7 @@ def forecast_frames(
 ) -> Forecast:
     """`forecast_clip` on a `Perception` that may have seen earlier frames already, and keeps what it sees.
 
-    A network that starts from what was measured corrects the geometric forecast: its camera's motion, its objects'
+    A network that starts from measurements corrects the geometric forecast: its camera's motion, its objects'
     velocities, and its image. Each of these parts is used where it wins a test on frames up to t
     (`vestcl.forecasting.network.backtest`); without any, the result is the geometric forecast. A network that starts
     from rest, and mode "feedback", have all parts and no test.
@@ -179,7 +179,7 @@ def _composed(
 
 
 class _Clock:
-    """Seconds of the networks: of all blocks that it is entered for, less what perception took in them."""
+    """Seconds of the networks: of all blocks that it is entered for, minus the time of perception in them."""
 
     def __init__(self, perception: Perception) -> None:
         self.seconds = 0.0

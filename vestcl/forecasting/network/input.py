@@ -74,7 +74,7 @@ def network_input(
     Raises:
         ValueError: frames of different sizes or cameras, no motion, or a matrix that is not finite.
 
-    Source: SPEC section 8; `vestcl.forecasting.geometric.forecast_frames` extrapolates alike.
+    Source: SPEC section 8; `vestcl.forecasting.geometric.forecast_frames` extrapolates in the same way.
     """
     if prev.layers.image.shape != cur.layers.image.shape:
         sizes = [f"{frame.layers.image.shape[1]}x{frame.layers.image.shape[2]}" for frame in (prev, cur)]

@@ -1,1 +1,1 @@
-"""How a trained model is run: loaded, timed by stage, by preset, without what a scene does not need."""
+"""How a trained model is run: loaded, timed by stage, by preset, with conditional computation."""

@@ -2,7 +2,7 @@
 
 oneDNN's convolutions do most of what the cores can, so compiling the networks or reordering their weights gains little
 (`vestcl.bench.network.variants` measures both). What gains: the blocks of object motion share one convolution over the
-frames, which all of them look at; what losses alone need is dropped; encoder and refinement may compute in bfloat16;
+frames, which all of them look at; what only losses need is dropped; encoder and refinement may compute in bfloat16;
 and a process that keeps the memory that it frees is spared its page faults.
 """
 
@@ -34,7 +34,7 @@ Precision = Literal["float32", "bfloat16"]
 #: oneDNN computes in float32, and bfloat16 costs conversions on top.
 _BFLOAT16: Final = ("avx512_bf16", "amx_bf16", "avx_ne_convert", "bf16")
 
-#: Of glibc's mallopt: no memory maps of their own for large blocks, nothing given back below 2 GiB; glibc's defaults.
+#: Of glibc's mallopt: no separate memory maps for large blocks, nothing given back below 2 GiB; glibc's defaults.
 _MALLOPT: Final = {True: ((-4, 0), (-1, 2**31 - 1)), False: ((-4, 65536), (-1, 128 * 1024))}
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
-#: Options that files list under "skip" and under "effort"; "autocast" has an entry of its own.
+#: Options that files list under "skip" and under "effort"; "autocast" has its own entry.
 _SKIPS: Final = ("seen", "background", "objects", "covered", "views", "margin", "still")
 _SWITCHES: Final = _SKIPS[:5]
 
@@ -104,5 +104,5 @@ BALANCED: Final = InferenceOptions(
     margin=16, still=True, min_transmittance=0.01, blocks=2, paint_scale=0.5, autocast="bfloat16"
 )
 
-#: Beyond them: details at a quarter of the size, objects move as they were measured to.
+#: Beyond them: details at a quarter of the size, objects move as measured.
 FAST: Final = replace(BALANCED, min_transmittance=0.03, blocks=0, paint_scale=0.25)

@@ -1,9 +1,9 @@
-"""How good a forecast by a network has to be: three points on the curve of run time against error.
+"""Inference presets: three points on the speed-accuracy curve.
 
     exact      float32; skips what changes nothing but rounding
     balanced   the knees that cost at most 0.1 dB of PSNR: what was measured as static is static, two blocks correct the
                motion of what does not, details are refined at half the size
-    fast       beyond them: details at a quarter of it, objects move as they were measured to
+    fast       beyond them: details at a quarter of it, objects move as measured
 
 `vestcl bench pareto` measures the curve; docs/time_against_error has it, and the points chosen.
 """
@@ -21,10 +21,10 @@ Quality = Literal["exact", "balanced", "fast"]
 #: The levels, best first.
 LEVELS: Final[tuple[Quality, ...]] = get_args(Quality)
 
-#: Of `vestcl forecast`: what it loses can't be seen.
+#: Of `vestcl forecast`: its loss of quality is not visible.
 USUAL: Final[Quality] = "balanced"
 
-#: The most that a level may lose against "exact" in PSNR to the true next frame, dB, mean over streets.
+#: The largest PSNR drop of a level against "exact" to the true next frame, dB, mean over streets.
 LOSS: Final[dict[Quality, float]] = {"exact": 0.0, "balanced": 0.1, "fast": 0.5}
 
 

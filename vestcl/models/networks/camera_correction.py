@@ -82,7 +82,7 @@ class BoundedCorrection(nn.Module):
     """The last layers of EMF, as the head of this file has them.
 
     Args:
-        path: frame intervals ahead that have a correction of their own; the last one holds for all later ones.
+        path: frame intervals ahead that have their own correction; the last one holds for all later ones.
         tokens: channels of a token.
     """
 

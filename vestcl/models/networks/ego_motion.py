@@ -125,7 +125,8 @@ class EgoMotion(nn.Module):
         return self.decide(prev, cur, mask_prev, mask_cur, prior)
 
     def look(self, features: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        """The first half of `forward`, which a frame goes through alone, and so once: its channels of the tokens.
+        """The first half of `forward`, which each frame goes through separately, and so once: its channels of the
+        tokens.
 
         Args:
             features: [B, features, h, w] of the inpainted background.

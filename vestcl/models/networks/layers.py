@@ -32,7 +32,7 @@ def side_by_side(images: Sequence[torch.Tensor]) -> torch.Tensor:
 
 
 def group_norm(channels: int, per_group: int) -> nn.GroupNorm:
-    """GroupNorm with groups of at least ``per_group`` channels, all alike; one group where there are fewer."""
+    """GroupNorm with groups of at least ``per_group`` channels, all of one size; one group where there are fewer."""
     groups = max(1, channels // per_group)
     while channels % groups:
         groups -= 1

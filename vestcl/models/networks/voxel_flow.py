@@ -1,4 +1,4 @@
-"""DMVFN's network: the best known forecast of video from two frames alone, by 2D voxel flow.
+"""DMVFN's network: the best known forecast of video from two frames only, by 2D voxel flow.
 
 Nine blocks from coarse to fine correct a flow [B, 4, H, W] px, which leads from the next frame back into frames 0 and
 1, and a mask that weighs the two warped frames:

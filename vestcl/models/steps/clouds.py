@@ -28,7 +28,7 @@ class Cloud(NamedTuple):
     """Points of input frames' layers, for all B images; gradients flow through all."""
 
     points_xyz: torch.Tensor
-    """[P, 3] m, in a camera of their own."""
+    """[P, 3] m, each in its own camera."""
     displacement_xyz: torch.Tensor
     """[P, 3] m: x + u is in the camera of t+k."""
     step_xyz: torch.Tensor
@@ -53,7 +53,7 @@ class Cloud(NamedTuple):
         return self.starts.diff().tolist()
 
     def picked(self, points: torch.Tensor, starts: torch.Tensor) -> "Cloud":
-        """Some points alone, by their rising indices [Q]; ``starts`` [B + 1] among those. They have no neighbours."""
+        """Only some points, by their rising indices [Q]; ``starts`` [B + 1] among those. They have no neighbours."""
         return Cloud._make([*(tensor.index_select(0, points) for tensor in self[:-2]), (), starts])
 
 

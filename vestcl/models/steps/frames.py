@@ -35,7 +35,7 @@ class EncodedFrame(NamedTuple):
 
 
 def check_frames(frame_prev: LayerBatch, frame_cur: LayerBatch, K: torch.Tensor) -> None:
-    """Refuse frames that are not alike.
+    """Refuse frames that differ in size or kind.
 
     Raises:
         ValueError: a tensor of another shape than [B, 3 or 1, H, W], a ``K`` that isn't [B, 3, 3], or a depth that is

@@ -51,7 +51,7 @@ class EncodedFrames:
 
     Content decides: a frame is known if every number of its layers and of the weights is as it was, wherever they lie
     in memory. So all of them are copied when a frame is kept: callers may overwrite their buffers, and weights may
-    change in any way. Threads share what is kept, and each has room for the two frames of its next step. A copy of a
+    change in any way. Threads share what is kept, and each has space for the two frames of its next step. A copy of a
     model (``copy.deepcopy``, pickle) begins with an empty memory.
     """
 

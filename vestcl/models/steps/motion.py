@@ -101,7 +101,7 @@ def arrived(
     to_next: MotionPrior | CameraMotion,
     flat: bool = False,
 ) -> Motion:
-    """The motion that brings what t - 1 shows to t, and leaves alone what t shows.
+    """The motion that brings what t - 1 shows to t, and does not change what t shows.
 
     Args:
         prev: frame at t - 1.

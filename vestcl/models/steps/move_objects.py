@@ -79,7 +79,7 @@ def move_objects(
             network(*map(box.cut, seen), box.cut(start) - beyond, blocks=options.blocks, backgrounds=behind)
         )
 
-    learning = torch.is_grad_enabled()  # losses alone look at candidates
+    learning = torch.is_grad_enabled()  # only losses look at candidates
     each = zip(*(one.candidates for one in forecasts), strict=True) if learning else ()
     candidates = [_whole(start, pieces, parts) for parts in each]
     return forecasts[0]._replace(flow=_whole(start, pieces, [one.flow for one in forecasts]), candidates=candidates)
@@ -137,7 +137,7 @@ def _rolling(foreground: torch.Tensor, residual: torch.Tensor) -> torch.Tensor:
 
 
 def _where(network: ObjectMotion, moving: torch.Tensor, options: InferenceOptions, tally: Tally) -> list[Box]:
-    """The parts of the image that OMF is to see; one alone where it chooses its blocks by the whole scene."""
+    """The parts of the image that OMF is to see; a single one where it chooses its blocks by the whole scene."""
     batch, _, height, width = moving.shape
     whole = Box(0, height, 0, width)
     if network.config.where == "everywhere" or not options.objects:

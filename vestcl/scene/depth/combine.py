@@ -1,6 +1,6 @@
 """A network's depth and the parallax of a moving camera, each where it is good.
 
-A network gives metres and a dense map, with errors of some 10 % that are alike over whole regions. Parallax gives
+A network gives metres and a dense map, with errors of some 10 % that are the same over whole regions. Parallax gives
 nearly exact ratios of depths where the camera moved and the scene is static: no scale, nothing near the point that it
 drives to, and nothing on what moves. So the network gives the length of the motion, parallax a smooth correction of the
 network, and at each pixel both are averaged by their precision.

@@ -52,8 +52,8 @@ class MotionDepth(NamedTuple):
     confidence: NDArray[np.float32]
     """[1, H, W] in [0, 1]: 1 = measured, 0 = a guess from the road and from what is around."""
     speed_before: float = 0.0
-    """Length of the motion before over that of this one, by parallax; 0 = unknown. The road gives each frame a scale of
-    its own, which differs by more than a car's speed does."""
+    """Length of the motion before over that of this one, by parallax; 0 = unknown. The road gives each frame its own
+    scale, which differs by more than a car's speed does."""
 
 
 def motion_depth(

@@ -22,7 +22,7 @@ from torch import nn
 #: What the image processors of all versions of transformers write.
 _PREPARATION: Final = "preprocessor_config.json"
 
-#: owner/name, or a name alone, as the hub has had at first.
+#: owner/name, or only a name, as the hub has had at first.
 _HUB_NAME: Final = re.compile(r"\w[\w.-]*(/\w[\w.-]*)?")
 
 #: Where the hub is, if HF_ENDPOINT does not name a mirror.
@@ -53,7 +53,7 @@ class Checkpoint:
         Args:
             name_or_path: a folder with config.json, preprocessor_config.json and the weights, or a hub name.
             networks: model type -> class, of what is accepted.
-            local_files_only: whether the hub is left alone: a hub name is then looked up in its cache alone.
+            local_files_only: whether the hub is not asked: a hub name is then looked up in its cache only.
 
         Raises:
             ImportError: transformers is not installed.

@@ -14,7 +14,8 @@ from vestcl.io.labels import LAST_TRAIN_ID, VOID
 from vestcl.scene import checked
 
 #: Frames whose estimates are kept, by clip and kind. A forecast reads two frames, each more than once (depth for the
-#: layers, classes for the mask and for the sky); eight leave room for looking back, at 2 MB of depth a KITTI frame.
+#: layers, classes for the mask and for the sky); eight leave memory for earlier frames, at 2 MB of depth per KITTI
+#: frame.
 KEPT: Final = 8
 
 Element = TypeVar("Element", np.float32, np.uint8)

@@ -36,7 +36,7 @@ def correspond(src: ArrayLike, dst: ArrayLike) -> Correspondence:
 
     Args:
         src: [3, H, W] RGB in [0, 1].
-        dst: [3, H, W] alike.
+        dst: [3, H, W] likewise.
 
     Raises:
         ValueError: shapes, numbers that aren't finite, or images too small for dense inverse search.

@@ -97,7 +97,7 @@ def refine_depth(
 def _measure(
     given: NDArray[np.float32], known: NDArray[np.bool_], K: NDArray[np.float64], view: OtherFrame
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Inverse depth [1, H, W] by the flow alone, |dp'/ds|^2 (px m)^2, and whether the flow keeps to its line."""
+    """Inverse depth [1, H, W] by the flow only, |dp'/ds|^2 (px m)^2, and whether the flow keeps to its line."""
     flow, error = view.correspondence
     moved = moved_pixels(flow)
     start, slope = epipolar(K, view.dst_from_src, *flow.shape[1:])

@@ -1,4 +1,4 @@
-"""How a camera turned and which way it went between two images, from dense flow alone: the essential matrix."""
+"""How a camera turned and which way it went between two images, from dense flow only: the essential matrix."""
 
 from typing import Final, NamedTuple
 
@@ -19,8 +19,8 @@ _FLOW_ERROR: Final = 0.5
 #: Distance to the epipolar line of RANSAC's inliers, and where the refinement's Cauchy loss bends, px.
 _OFF_LINE, _BEND = 0.7, 0.3
 
-#: A turn alone explains flow that it meets within this many px. If it explains that share of the image's lower half,
-#: where a road would stream past, the camera has not moved.
+#: A rotation by itself explains flow that it meets within this many px. If it explains that share of the image's lower
+#: half, where a road would stream past, the camera has not moved.
 _TURNED, _STILL_SHARE = 0.6, 0.6
 
 #: Fewer points than that say nothing.
@@ -47,9 +47,9 @@ class Pose(NamedTuple):
 def relative_pose(correspondence: Correspondence, K: Array) -> Pose:
     """argmin over R, |t| = 1 of sum rho(x_dst^T [t]x R x_src / gradient), the Sampson distance with Cauchy's rho.
 
-    It has several minima, as a turn and a step aside look alike. So it is searched from what RANSAC over five points
-    finds and from a motion along the camera's axis, and the lowest is taken. Where a turn alone explains the lower half
-    of the image, t = 0.
+    It has several minima, as a turn and a step aside look similar. So it is searched from what RANSAC over five points
+    finds and from a motion along the camera's axis, and the lowest is taken. Where a rotation by itself explains the
+    lower half of the image, t = 0.
 
     Args:
         correspondence: from src to dst.

@@ -26,7 +26,7 @@ def fill_holes(
 ) -> NDArray[np.float32]:
     """Push and pull: a hole takes the weighted mean of the next coarser level, which is filled likewise.
 
-    Holes inside are filled from the far side first, those that reach the border from all sides alike;
+    Holes inside are filled from the far side first, those that reach the border from all sides equally;
     there what is seen continues along the lines through the vanishing point, if that is known (`carry_on`).
 
     Args:
@@ -54,7 +54,7 @@ def fill_holes(
 
 
 def push_pull(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """``image`` [C, H, W] with what is not ``known`` [H, W] filled from all sides alike; all 0 if nothing is known."""
+    """``image`` [C, H, W] with what is not ``known`` [H, W] filled from all sides; all 0 if nothing is known."""
     planes = np.ascontiguousarray(np.where(known, image, np.float32(0)).transpose(1, 2, 0))
     return np.where(known, image, _pull(planes, known.astype(np.float32))[0].transpose(2, 0, 1))
 

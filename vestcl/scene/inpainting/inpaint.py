@@ -12,7 +12,7 @@ from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 from vestcl.scene.inpainting.structure import structure_behind
 
 #: How colour is filled if nothing else is asked for. `vestcl bench inpaint` over 20 streets: regions 15.7 dB in 0.04 s,
-#: push-pull 15.5 dB, fsr 15.2 dB in 0.6 s, telea 14.2 dB, ns 13.6 dB, biharmonic 11.9 dB; and regions alone keeps the
+#: push-pull 15.5 dB, fsr 15.2 dB in 0.6 s, telea 14.2 dB, ns 13.6 dB, biharmonic 11.9 dB; and only regions keeps the
 #: edge between road and houses.
 DEFAULT: Final = "regions"
 
@@ -42,8 +42,8 @@ def inpaint_background(
         image: [3, H, W] RGB in [0, 1].
         depth: [1, H, W] m, above 0 everywhere.
         mask: M [1, H, W] bool, True = static background.
-        dilate: px by which the hole grows, lest the rim of the foreground is taken for background; None is 10 px at
-            832 columns, and in proportion.
+        dilate: px by which the hole grows, so that the rim of the foreground is not taken for background; None is 10 px
+            at 832 columns, and in proportion.
         method: a name of `inpainters.METHODS`, "lama:PATH", a function as `Inpainter`; None is DEFAULT.
 
     Returns:

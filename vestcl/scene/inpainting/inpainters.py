@@ -39,7 +39,7 @@ class Inpainter(Protocol):
 
 
 def regions(colour: NDArray[np.float32], hole: NDArray[np.bool_], road: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Push and pull, the road from the road alone and the static objects on it from the rest."""
+    """Push and pull, the road from the road only and the static objects on it from the rest."""
     filled = colour
     for part in (road, ~road):
         known = part & ~hole

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from vestcl.scene.flow.correspondence import sample
 
-#: Where neighbouring lines enter the hole is smoothed over this many of them, both sides, in an image 832 wide, lest
-#: the ragged edge of a hole is drawn out.
+#: Where neighbouring lines enter the hole is smoothed over this many of them, both sides, in an image 832 wide, so
+#: that the ragged edge of a hole is not extended.
 _SMOOTH, _WIDTH = 9, 832
 
 #: The share of what is carried on falls to 1/e at that distance into the hole, over the distance of its edge from the

@@ -25,7 +25,7 @@ Array = NDArray[np.float32]
 #: The power g: 2 mixes more, 4 picks; on windows of six real clips 3 loses to neither by more than 0.1 dB.
 _SHARPNESS: Final = 3.0
 
-#: Flow has noise of its own, which rest and objects' velocities lack: to count alike its errors must be less by this.
+#: Flow has its own noise, which rest and objects' velocities lack: to count equally its errors must be less by this.
 #: Of 1 and 1.25, 1.25 gains 0.6 dB where the camera rests (kitti_tracking_0006) and loses 0.3 in kitti_clip, at t+1.
 _FLOW_MARGIN: Final = 1.25
 

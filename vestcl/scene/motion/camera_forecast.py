@@ -38,7 +38,7 @@ from vestcl.scene.motion.gauss_markov import (
 Array = NDArray[np.float64]
 
 #: Standard deviation of a measured rotation, rad per axis: what PnP over a dense flow gives on a driving video with
-#: depth, and of the yaw without depth, as a turn and a step aside look much alike.
+#: depth, and of the yaw without depth, as a turn and a step aside look similar.
 _TURN_NOISE: Final = (np.radians(0.045), np.radians(0.12))
 
 #: Without depth a rotation has no depth's errors: between two sharp images flow gives it to a tenth of a pixel.

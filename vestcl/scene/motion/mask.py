@@ -13,7 +13,7 @@ from vestcl.scene.flow.parallax import epipolar, moved_pixels, pixel_centres
 #: Forward-backward error beyond which flow is not believed, px.
 _FLOW_ERROR: Final = 1.0
 
-#: Flow that is off by more pixels than that, plus a share of the rigid flow, shows motion of its own. Depth errors of
+#: Flow that is off by more pixels than that, plus a share of the rigid flow, shows object motion. Depth errors of
 #: a static scene stay below on KITTI.
 _MOVES, _MOVES_SHARE = 2.0, 0.15
 

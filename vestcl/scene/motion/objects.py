@@ -16,7 +16,7 @@ from vestcl.scene.flow.parallax import moved_pixels
 #: Neighbours whose depths differ by a larger factor belong to different objects.
 _JUMP: Final = 0.08
 
-#: Regions of fewer pixels, as a share of the image, are too small to measure and follow the camera alone.
+#: Regions of fewer pixels, as a share of the image, are too small to measure and follow only the camera.
 _SMALLEST: Final = 0.0003
 
 #: Forward-backward error beyond which flow is not believed, px.
@@ -25,7 +25,7 @@ _FLOW_ERROR: Final = 1.0
 #: Error of flow, px; residuals beyond this many times of it count linearly (Huber).
 _FLOW_STD, _HUBER = 0.5, 2.0
 
-#: This many neighbouring pixels err alike, and count as one.
+#: This many neighbouring pixels have the same error, and count as one.
 _CORRELATED: Final = 50.0
 
 #: What is expected of a velocity before anything is measured, metres per frame: 20 m/s at 10 Hz across and ahead, and

@@ -45,7 +45,7 @@ def whole_objects(
 
     Pixel p is added if G(w (|I(p) - I_prev(b(p))| - |I(p) - I_prev(p + f)|)) / G(w) > NOISE, with G smoothing up to the
     edges of the image, and w = 0 where the object was in front of the background before, which then says nothing.
-    Small holes and narrow gaps are filled: there both motions may look alike.
+    Small holes and narrow gaps are filled: there both motions may look the same.
 
     Args:
         moving: [H, W].

@@ -106,8 +106,8 @@ class Pair(NamedTuple):
 
 
 def search(instances: NDArray[np.int32], by_flow: Array, depth: NDArray[np.float32], pair: Pair) -> Array:
-    """v_n [n + 1, 3] m per frame for each object: of 0, what flow says, and steps ahead and aside, what looks most
-    alike.
+    """v_n [n + 1, 3] m per frame for each object: of 0, what flow says, and steps ahead and aside, what matches
+    best.
 
     min over v of the mean over pixels of min(|I(p) - I_prev(project(K (R (x - v) + t)))|, OTHER), first along the
     camera's axes x and z, then around the best by ever smaller steps. Unless that is LEFT times what v = 0 gives or
@@ -202,7 +202,7 @@ def _costs(instance: _Points, tries: Array) -> NDArray[np.float32]:
 def confirmed(
     corrected: NDArray[np.float32], velocity: NDArray[np.float32], depth: NDArray[np.float32], pair: Pair
 ) -> NDArray[np.float32]:
-    """v + g (c - v): ``velocity`` v, corrected to c as far as the images then look more alike.
+    """v + g (c - v): ``velocity`` v, corrected to c as far as the images then match better.
 
     g = (d_v - d_c) / ((1 - LEFT) d_v + NOISE / 2), between 0 and 1, where d is the difference of both frames' colours
     under a velocity: the mean of what it is when smoothed up to the image's edges and when averaged over superpixels,

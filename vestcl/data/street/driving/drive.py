@@ -1,4 +1,4 @@
-"""How the street's camera drives: a smooth sway of its own, the wobble of a real recording, or as cars do.
+"""How the street's camera drives: a smooth sway, the wobble of a real recording, or as cars do.
 
 A drive is six numbers at every time: metres along the road, to the right of the lane's middle and below the camera's
 usual height, and the radians yaw (right), pitch (up) and roll (clockwise) of world_from_camera = Ry Rx Rz. Of a
