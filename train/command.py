@@ -20,7 +20,7 @@ FAILED: Final = 2
 #: What a user can correct: settings, files, the disk, devices, other processes.
 ERRORS: Final = (ValueError, OSError, opencl.DeviceError, CheckpointError, LostProcessError)
 
-#: What torch says, at any place of the main process, when a data loader's process has ended.
+#: What torch says, anywhere in the main process, when a data loader's process has ended.
 _WORKER: Final = re.compile(r"DataLoader worker \(pid\(?s?\)?")
 
 

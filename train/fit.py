@@ -43,7 +43,7 @@ STOPPED: Final = 128 + signal.SIGTERM
 
 
 class TrainingError(RuntimeError):
-    """Training can't go on; the message says what to do."""
+    """Training can't continue; the message says what to do."""
 
 
 @dataclass(frozen=True)

@@ -192,7 +192,9 @@ def unpack(path: Path, which: Callable[[int], Sequence[int]] = range) -> Forecas
                 found.append(Entry(planes, colours[COLOURS:], ahead[number]))
             return ForecastWindow(str(file["clip"]), int(file["current"]), found)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path}: is no window of `train.forecasts` ({error}); remove it and make it again") from error
+        raise ValueError(
+            f"{path}: is not a window of `train.forecasts` ({error}); remove it and make it again"
+        ) from error
 
 
 def make(options: Forecasts, console: Console) -> Made:

@@ -65,7 +65,7 @@ class RefinementConfig:
     """A run. Of `Stage`, steps, batch and learning rate count; of `RunConfig`, all but ``keep`` and ``image_every``."""
 
     name: Annotated[str, Field(min_length=1)]
-    """Of the model that is written."""
+    """Name of the model that is written."""
     out: Path
     data: ForecastData
     stage: Stage
@@ -95,7 +95,7 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> RefinementCo
 
 
 class Samples:
-    """Samples drawn from a cache: each is a function of the seed, the step and its place in the batch.
+    """Samples drawn from a cache: each is a function of the seed, the step and its position in the batch.
 
     Args:
         data: which folders.

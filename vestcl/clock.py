@@ -43,7 +43,7 @@ class Clock:
 
     seconds: dict[str, float] = field(default_factory=dict)
     cpu_seconds: dict[str, float] = field(default_factory=dict)
-    """Of all threads of the process."""
+    """CPU seconds of all threads of the process."""
     seen: Seen | None = None
     """Called after each stage that has a result to show, outside of what is timed."""
     outer: "Clock | None" = field(default=None, repr=False, compare=False)
@@ -51,7 +51,7 @@ class Clock:
     exclusive: bool = False
     """Whether a stage's time is without the stages of this clock inside it."""
     _inner: tuple[float, float] = field(default=(0.0, 0.0), repr=False, compare=False)
-    """Of the stages inside the current one: seconds, and the CPU's."""
+    """Seconds and CPU seconds of the stages inside the current one."""
 
     @contextlib.contextmanager
     def time(self, name: str) -> Iterator[None]:
@@ -109,5 +109,5 @@ def watching(seen: Seen | None = None) -> Iterator[Clock]:
 
 
 def current_clock() -> Clock:
-    """The clock of the thread's `watching`; outside of one, a clock that nobody reads."""
+    """The clock of the thread's `watching`; outside of one, a clock that is not read."""
     return _clock.get() or Clock()

@@ -22,7 +22,7 @@ TORN: Final = 2.5
 #: a plane: magnification changes from pixel to pixel, and depths are inexact.
 SLANTED: Final = 1.25
 
-#: Of a plane the steps to the neighbours at both sides differ by less than that share of their mean: those of a road
+#: On a plane the steps to the neighbours at both sides differ by less than that share of their mean: those of a road
 #: 17 rows below the horizon by 0.26 where they come to lie ten times as far apart, those of noise by 1 and more.
 BENT: Final = 0.4
 

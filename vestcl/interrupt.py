@@ -138,7 +138,7 @@ def guard_imports() -> None:
 
 @contextlib.contextmanager
 def _handler() -> Iterator[None]:
-    """SIGINT ends the process, if nobody else handles it."""
+    """SIGINT ends the process, if nothing else handles it."""
     before = signal.getsignal(signal.SIGINT)
     owned = _own()
     try:
@@ -149,7 +149,7 @@ def _handler() -> Iterator[None]:
 
 
 def _own() -> bool:
-    """Handle SIGINT, if nobody else does; whether it was possible: only the main thread may."""
+    """Handle SIGINT, if nothing else does; whether it was possible: only the main thread may."""
     global _owner
     if signal.getsignal(signal.SIGINT) not in (signal.default_int_handler, stop_now):
         return False

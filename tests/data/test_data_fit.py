@@ -200,7 +200,7 @@ def test_virtual_kitti(tmp_path: Path) -> None:
 
 
 def test_cityscapes(tmp_path: Path) -> None:
-    """Cut below 2048 x 800, which is half of it here: the bonnet is gone, and so are the proportions."""
+    """Cut below 2048 x 800, which is half of it here: the bonnet has ended, and so are the proportions."""
     test_data_cityscapes.tree(tmp_path)
     folder = tmp_path / "leftImg8bit_sequence" / "val" / "frankfurt"
     for path in folder.iterdir():

@@ -86,7 +86,7 @@ def test_bad_cameras_are_named(tmp_path: Path, camera: dict[str, object], messag
         open_folder(folder(tmp_path, **camera))
 
 
-@pytest.mark.parametrize(("text", "message"), [("{", "is no JSON"), ("[1]", "must be an object")])
+@pytest.mark.parametrize(("text", "message"), [("{", "is not JSON"), ("[1]", "must be an object")])
 def test_no_json(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=rf"camera\.json: {message}"):
         read_camera(write_text(tmp_path / "camera.json", text))

@@ -61,7 +61,7 @@ def test_what_was_looked_for_is_reported(tmp_path: Path) -> None:
         open_sequence(tmp_path)
     for layout in ("KITTI odometry: calib.txt", "Cityscapes: leftImg8bit_sequence", "frames/rgb", "camera.json"):
         assert layout in str(e.value)
-    with pytest.raises(ValueError, match=r"notes\.txt: is not a clip"):
+    with pytest.raises(ValueError, match=r"notes\.txt: unrecognised dataset layout"):
         open_sequence(write_text(tmp_path / "notes.txt", "hello"))
 
 

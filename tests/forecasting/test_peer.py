@@ -104,7 +104,7 @@ def test_it_asks_the_same_of_a_clip_as_the_geometric_forecast() -> None:
 
 
 def test_times_go_on_and_a_gap_is_noted() -> None:
-    """Timestamps of a clip, at 10 Hz with a frame lost before t: the forecast frames' go on by its interval."""
+    """Timestamps of a clip, at 10 Hz with a frame lost before t: the forecast frames' continue by its interval."""
     clip, seconds = street(4), (0.0, 0.1, 0.2, 0.4)
     samples = tuple(dataclasses.replace(s, timestamp=at) for s, at in zip(clip, seconds, strict=True))
     clip, network = dataclasses.replace(clip, samples=samples), Stand(lambda a, b: b)

@@ -143,8 +143,12 @@ def test_files_that_are_too_long(tmp_path: Path) -> None:
         ("depth.png", png(60_000, 60_000, kind=0), "at most 67108864 in all"),
         ("labels.png", png(60_000, 60_000, kind=0), "at most 67108864 in all"),
         ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000)}"), "at most 67108864"),
-        ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (1, 9, 99999999999999999999)}"), "a side"),
-        ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (-3, -4)}", bytes(48)), "a side"),
+        (
+            "depth.npy",
+            npy("{'descr': '<f4', 'fortran_order': False, 'shape': (1, 9, 99999999999999999999)}"),
+            "per side",
+        ),
+        ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (-3, -4)}", bytes(48)), "per side"),
         ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (8000, 8000)}", bytes(64)), "damaged"),
         ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (2, 2)}", bytes(17)), "damaged"),
         ("depth.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (0, 2)}"), "1 to 65536 pixels per side"),
@@ -166,7 +170,7 @@ def test_jpeg_headers(tmp_path: Path) -> None:
     whole = contents(tmp_path)["rgb.jpg"]
     at = whole.index(b"\xff\xc0") + 5
     path = tmp_path / "rgb.jpg"
-    for height, width, message in [(65535, 65535, "at most 67108864 in all"), (0, 30, "a side"), (20, 0, "a side")]:
+    for height, width, message in [(65535, 65535, "at most 67108864 in all"), (0, 30, "per side"), (20, 0, "per side")]:
         path.write_bytes(whole[:at] + struct.pack(">HH", height, width) + whole[at + 4 :])
         said = refusals(path, READERS["rgb.jpg"])
         assert len(said) == 2 and all(message in text for text in said)
@@ -182,9 +186,9 @@ def test_exr_headers(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     at = whole.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
     for window, message in [
         ((0, 0, 999_999, 999_999), "at most 67108864 in all"),
-        ((0, 0, 2**31 - 1, 2**31 - 1), "a side"),
-        ((-(2**31), 0, 2**31 - 1, 0), "a side"),
-        ((9, 9, 0, 0), "a side"),
+        ((0, 0, 2**31 - 1, 2**31 - 1), "per side"),
+        ((-(2**31), 0, 2**31 - 1, 0), "per side"),
+        ((9, 9, 0, 0), "per side"),
         ((0, 0, 8000, 8000), "is not an OpenEXR image, or a damaged one"),
     ]:
         path.write_bytes(whole[:at] + struct.pack("<4i", *window) + whole[at + 16 :])

@@ -59,7 +59,7 @@ def test_a_constant_flow_and_a_sure_mask_shift_one_frame() -> None:
 
 
 def test_routing_runs_what_it_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each scene of a batch gets what its own blocks give, whatever the others take; blocks that nobody takes rest."""
+    """Each scene of a batch gets what its own blocks give, whatever the others take; unused blocks do not run."""
     calls = []
     whole = VoxelFlowBlock.forward
 

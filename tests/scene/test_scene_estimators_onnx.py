@@ -231,7 +231,7 @@ def test_descriptions_of_classes_are_read_strictly(file: Path, description: dict
 
 def test_a_json_that_is_none(file: Path) -> None:
     write_mix(file, [RED])
-    for text, message in (("{", "is no JSON"), ("[1]", "must be an object"), ('{"std": NaN}', "is no JSON")):
+    for text, message in (("{", "is not JSON"), ("[1]", "must be an object"), ('{"std": NaN}', "is not JSON")):
         file.with_suffix(".json").write_text(text)
         with pytest.raises(ValueError, match=message):
             OnnxDepth.load(file)

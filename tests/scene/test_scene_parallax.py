@@ -112,7 +112,7 @@ def test_what_moves_is_unchanged() -> None:
 
 
 def test_even_a_small_object_that_moves_is_unchanged() -> None:
-    """A pedestrian of 8 x 16 pixels at 6 m before a wall at 40 m is no island."""
+    """A pedestrian of 8 x 16 pixels at 6 m before a wall at 40 m is not an island."""
     depth, static = flat(40), EVERYWHERE.copy()
     small = np.s_[:, 40:56, 150:158]
     depth[small], static[small] = 6, False

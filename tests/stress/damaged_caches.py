@@ -140,7 +140,7 @@ def json_key(rng: Rng, path: Path) -> None:
 
 
 def damaged_json(rng: Rng, value: Any) -> Any:
-    """A key is gone or has another name, or a value is another one, somewhere in ``value``."""
+    """A key has ended or has another name, or a value is another one, somewhere in ``value``."""
     place = value
     while True:
         keys = list(place) if isinstance(place, dict) else list(range(len(place)))
@@ -203,7 +203,7 @@ def header_names(rng: Rng, path: Path) -> None:
 
 
 def without_tensor(rng: Rng, path: Path) -> None:
-    """A tensor and its checksum are gone, and all else fits."""
+    """A tensor and its checksum are missing, and everything else fits."""
     header, data = opened(path)
     gone = tensor_name(rng, header)
     first, last = header.pop(gone)["data_offsets"]

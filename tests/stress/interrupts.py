@@ -116,7 +116,7 @@ def prepare() -> None:
 
 
 class Interrupter:
-    """Calls that are interrupted, and what came of it."""
+    """Calls that are interrupted, and what was measured of it."""
 
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)

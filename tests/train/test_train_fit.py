@@ -350,7 +350,7 @@ def broken(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, mode
 
 
 def test_no_number_stops(broken: None, cache: Path, tmp_path: Path) -> None:
-    """The step, what was shown, and where to go on from."""
+    """The step, what was shown, and where to resume."""
     settings = configured(cache, tmp_path)
     windows = fit.window_set(settings.data)
     shown = ", ".join(windows.label(draw) for draw in windows.global_batch(0, 3, 2))

@@ -1,4 +1,4 @@
-"""train.run.ranks: processes that share a batch come to one process's weights, and go on after one of them is lost."""
+"""train.run.ranks: processes that share a batch reach one process's weights, and resume after a lost process."""
 
 import os
 import signal
@@ -149,7 +149,7 @@ def test_two_processes_reach_the_weights_of_one(one: Path, two: Path, monkeypatc
 def test_started_again_they_reach_the_same_weights(
     two: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """The second one is lost after step 5: both go on from step 4, and to the same bits as if nothing had happened."""
+    """The second one is lost after step 5: both resume from step 4, and to the same bits as if nothing had happened."""
     out = tmp_path / "out"
     reported = run_both(street(tmp_path_factory), out, "SIGKILL update 5 1")
     assert "from step 4 to step 8, 2 processes" in reported

@@ -112,7 +112,7 @@ def test_options_that_cannot_be(options: tuple[str, ...], message: str, tmp_path
 def test_a_damaged_window_is_named(cache: Path, tmp_path: Path) -> None:
     content = next(iter(cache.glob("*/*.npz"))).read_bytes()
     (tmp_path / "a.npz").write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match=r"a\.npz: is no window of `train\.forecasts`"):
+    with pytest.raises(ValueError, match=r"a\.npz: is not a window of `train\.forecasts`"):
         unpack(tmp_path / "a.npz")
 
 

@@ -106,7 +106,7 @@ def write_card(options: Card) -> list[Path]:
     state = checkpoint.load_latest(options.run)
     if state is None or not (options.run / LOG).is_file():
         raise ValueError(f"`run` must be a folder of train.fit, with a checkpoint and {LOG}, got {options.run}")
-    rows = [row for row in read_log(options.run / LOG) if row["step"] <= state.step]  # a run may be going on
+    rows = [row for row in read_log(options.run / LOG) if row["step"] <= state.step]  # a run may be in progress
     out = options.out
     if not rows:
         raise ValueError(f"`run` must have made steps that were logged, got none in {options.run / LOG}")

@@ -164,7 +164,8 @@ def _range(values: Sequence[float]) -> str:
 
 
 def prepare_commands(config: Config) -> list[str]:
-    """`vestcl prepare` of the streets that each folder holds, as far as they are known; "#" before what is no street.
+    """`vestcl prepare` of the streets that each folder holds, as far as they are known; "#" before what is not a
+    street.
 
     Raises:
         ValueError: data that is not there any more.
@@ -293,7 +294,7 @@ def result_tables(results: dict[str, Any], model: str, name: str, horizons: Sequ
 
 
 def _cells(methods: dict[str, Any], difference: dict[str, Any], metric: str, at: int) -> list[str]:
-    """Of every method, and of the difference where there is one."""
+    """Cells of every method, and of the difference where there is one."""
     digits = METRICS[metric].digits
     cells = [_interval(found[metric][at], digits) for found in methods.values()]
     return [*cells, _difference(difference[metric][at], digits)] if difference else cells

@@ -41,7 +41,7 @@ class Degradation:
 
     grey: bool
     prev_gain: tuple[float, float, float]
-    """Of red, green and blue, in linear light: the frame at t - 1 against that at t."""
+    """Gain of red, green and blue in linear light at t - 1, relative to t."""
     shutter: float
     """Share of an interval during which it is open; 0 is sharp."""
     shot: float
@@ -49,7 +49,7 @@ class Degradation:
     read: float
     """That at level 0."""
     quality: int | None
-    """Of JPEG, 1 to 100; None is not compressed."""
+    """JPEG quality, 1 to 100; None: not compressed."""
 
 
 def draw(rng: np.random.Generator, settings: DegradeConfig) -> Degradation | None:

@@ -60,7 +60,7 @@ class Batch(NamedTuple):
 
 
 class Draw(NamedTuple):
-    """One place in a batch: which window, and what is made of it."""
+    """One sample of a batch: which window, and what is made of it."""
 
     clip: int
     """Index of the clip."""
@@ -170,7 +170,7 @@ class WindowSet:
         return found
 
     def global_batch(self, seed: int, step: int, batch: int) -> list[Draw]:
-        """The places of a step's batch, over all ranks.
+        """The samples of a step's batch, over all ranks.
 
         Position p = step batch + i of an endless sequence has the window that epoch p // n's permutation has at
         p mod n, with n windows: every window once per epoch. With weights p's group is drawn first, and n counts its

@@ -32,7 +32,7 @@ _NOT_IN_KEY: Final = (
 #: Settings of later versions, with what changes nothing.
 _LATER: Final = {"drive": "usual", "street_fps": None}
 
-#: Of the scores' files: raised when what a window is given or how it is scored changes.
+#: Version of the scores' files: raised when a window's inputs or its scoring change.
 _SCORING: Final = 3
 
 

@@ -72,7 +72,7 @@ class Evaluation:
     """Take depth from stereo pairs even where clips have depth (laser scans, or a street's true depth). Rows that do
     end in "stereo pair"; where the right camera's future is judged they come next to monocular ones."""
     seeds: tuple[int, int] = (HELD_OUT[0], HELD_OUT[-1])
-    """Of streets: the first and the last."""
+    """Seeds of streets: the first and the last."""
     drive: Literal["usual", "road"] = "usual"
     """How cameras drive down streets: as the street has it, or with bends, braking, stops and a body on springs."""
     street_fps: float | None = None

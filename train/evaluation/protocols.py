@@ -69,17 +69,17 @@ class Where:
     data: Path | None
     """A data set's root, or a clip."""
     seeds: range
-    """Of streets."""
+    """Seeds of streets."""
     size: tuple[int, int]
     """(height, width) of streets, px."""
     frames: int
-    """Of a street."""
+    """Frames of a street."""
     samples: int
     """Rays per pixel and direction, of streets."""
     prepared: Path | None = None
     """Folder of prepared clips, in place of ``data``."""
     accumulated_depth: bool = False
-    """Of KITTI raw: depth from `proj_depth/groundtruth`, which has the scans of later frames, too."""
+    """KITTI raw: depth from `proj_depth/groundtruth`, which has the scans of later frames, too."""
     driven: street_input.Driven = street_input.USUAL
     """How streets are driven."""
 

@@ -249,7 +249,7 @@ def as_json(results: EvaluationResults, about: Mapping[str, Any]) -> dict[str, A
 
 
 def _all_differences(results: EvaluationResults) -> dict[tuple[str, str], dict[str, list[Difference]]]:
-    """Of each model from the geometric forecast, or from constant velocity."""
+    """Differences of each model from the geometric forecast, or from constant velocity."""
     groups = by_method(results.records)
     found = {}
     for (view, method), own in groups.items():

@@ -36,7 +36,7 @@ from train.run.rng import rng_state
 from vestcl.models.checkpoint import read_checkpoint, write_checkpoint
 from vestcl.models.config import ModelConfig
 
-#: Of the layout above; another one is not read.
+#: Version of the layout above; other versions are not read.
 FORMAT: Final = 1
 
 _MODEL: Final = "model.safetensors"
@@ -59,7 +59,7 @@ class CheckpointError(RuntimeError):
 
 
 def package_versions() -> dict[str, str]:
-    """Of what a run's numbers depend on."""
+    """Versions of the packages that a run's numbers depend on."""
     return {
         "python": platform.python_version(), "torch": str(torch.__version__), "numpy": np.__version__,
         "vestcl": vestcl.__version__,
@@ -68,7 +68,7 @@ def package_versions() -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class TrainingState:
-    """All that a run needs to go on as if it had never stopped."""
+    """All that a run needs to resume as if it had never stopped."""
 
     step: int
     """Updates done, in all stages; the data's position follows from it."""

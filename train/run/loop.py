@@ -56,7 +56,7 @@ class Loop(ABC):
     """
 
     name: ClassVar[str]
-    """Of the network in the state."""
+    """Name of the network in the state."""
 
     def __init__(self, out: Path, network: nn.Module, optimiser: OptimiserConfig, run: RunConfig) -> None:
         self.out, self.network, self.optimiser, self.run = out, network, optimiser, run

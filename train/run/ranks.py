@@ -22,12 +22,12 @@ PATIENCE: Final = timedelta(minutes=10)
 #: The largest TCP port.
 _PORTS: Final = 65_535
 
-#: What gloo's errors, plain RuntimeErrors, have in their text when another process is gone.
+#: What gloo's errors, plain RuntimeErrors, have in their text when another process has ended.
 _GONE: Final = re.compile(r"gloo|connection (closed|reset|refused)|broken pipe|timed? ?out", re.IGNORECASE)
 
 
 class LostProcessError(RuntimeError):
-    """Another process of the run could not be reached, or is gone."""
+    """Another process of the run could not be reached, or has ended."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Ranks:
         return bool(total)
 
     def mean(self, values: dict[str, float]) -> dict[str, float]:
-        """Of each value over the processes, which all have the same names."""
+        """Mean of each value over the processes, which all have the same names."""
         if self.world == 1:
             return values
         total = torch.tensor(list(values.values()), dtype=torch.float64) / self.world

@@ -34,7 +34,7 @@ _CELL: Final = 416
 
 
 class Reporter:
-    """Of the run ``config`` from ``step`` on; in processes other than the first it is silent.
+    """Reports the run ``config`` from ``step`` on; in processes other than the first it is silent.
 
     Args:
         config: of the run.

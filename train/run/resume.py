@@ -1,4 +1,4 @@
-"""Whether a run may go on from a checkpoint that was written under another configuration."""
+"""Whether a run may resume from a checkpoint that was written under another configuration."""
 
 import re
 import warnings
@@ -22,7 +22,7 @@ def check_resume(state: TrainingState, config: Config) -> None:
 
     Args:
         state: the checkpoint.
-        config: of the run that is to go on.
+        config: of the run to resume.
 
     Raises:
         ValueError: something else differs; the message says which keys, what they were and what they are. Or what is

@@ -31,7 +31,7 @@ class Update:
     terms: dict[str, float]
     """The loss, its terms before their weights, and the gradient's norm; means over the processes."""
     seconds: dict[str, float]
-    """Of this process: "splatting" is all that OpenCL did, forward and backward, "networks" the rest."""
+    """Seconds of this process: "splatting" is all that OpenCL did, forward and backward, "networks" the rest."""
     view: RenderedView | None
     """Without the graph of its computation. None in stages that render nothing."""
     skipped: bool
@@ -63,7 +63,7 @@ def build_model(config: Config) -> Forecaster:
     return model.train()
 
 
-#: Of a model's state, what depends on how EMF corrects a prior.
+#: Entries of a model's state that depend on how EMF corrects a prior.
 _HEADS: Final = tuple(f"ego_motion.{name}." for name in ("shown", "swayed", "motion", "bounded"))
 
 
@@ -81,7 +81,7 @@ def _fitting(given: Forecaster, model: Forecaster) -> dict[str, torch.Tensor]:
 
 
 def model_config(config: Config) -> ModelConfig:
-    """Of the model that is trained."""
+    """Configuration of the trained model."""
     return configuration(config.model)
 
 
@@ -164,7 +164,7 @@ class Trainer:
         return Update(self.ranks.mean(logged), seconds, shown, broken)
 
     def state(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Of Adam and of the learning rate's schedule."""
+        """State of Adam and of the learning rate's schedule."""
         return self.adam.state_dict(), self.schedule.state_dict()
 
     def restore(self, adam: dict[str, Any], schedule: dict[str, Any]) -> None:

@@ -36,7 +36,7 @@ class DegradeConfig:
     """
 
     share: Share = 0.5
-    """Of windows that are degraded; the others are as they were prepared."""
+    """Share of windows that are degraded; the others stay as prepared."""
     grey: Share = 0.25
     """Probability that all images of such a window are grey."""
     exposure: Weight = 0.15
@@ -101,7 +101,7 @@ class OptimiserConfig:
     """Adam, with decoupled weight decay (AdamW) where that is above 0."""
 
     betas: tuple[Annotated[float, Field(ge=0, lt=1)], Annotated[float, Field(ge=0, lt=1)]] = (0.9, 0.999)
-    """Of the running means of the gradient and of its square."""
+    """Decays of the running means of the gradient and of its square."""
     weight_decay: Weight = 0.0
     clip_norm: Annotated[float, Field(gt=0)] | None = 1.0
     """The gradient's norm over all parameters is cut to this; null cuts nothing."""
@@ -145,9 +145,9 @@ class LossConfig:
     """1 - SSIM, over as many scales as the image holds; not in the paper."""
     pose: PoseConfig = PoseConfig()
     residual_motion: Weight = 0.0
-    """Of how far object motion strays from the rigid flow, relative to depth."""
+    """Weight of the distance of object motion from the rigid flow, relative to depth."""
     routing: Weight = 1.0
-    """Of models with +routing: `vestcl.models.budget_loss`, so that its budget of blocks runs on average."""
+    """Weight of `vestcl.models.budget_loss` for models with +routing, so that its budget of blocks runs on average."""
 
 
 @dataclass(frozen=True, config=RULES)
@@ -197,11 +197,11 @@ class RunConfig:
     image_every: CountOrNone = 500
     """Steps between two images; 0 writes none."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Of encoder and refinement; motion, splatting and losses are float32."""
+    """Precision of encoder and refinement; motion, splatting and losses are float32."""
     on_nan: Literal["stop", "skip"] = "stop"
     """What follows a non-finite loss or gradient."""
     threads: Count | None = None
-    """Of torch, in each process; null leaves it to torch."""
+    """Threads of torch in each process; null: torch's default."""
 
 
 class Position(NamedTuple):
@@ -268,7 +268,7 @@ class Config(StageParts):
 
     @property
     def steps(self) -> int:
-        """Of all stages."""
+        """Steps of all stages."""
         return sum(stage.steps for stage in self.stages)
 
     def position(self, step: int) -> Position:

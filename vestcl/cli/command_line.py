@@ -143,7 +143,7 @@ class _Lines(logging.Handler):
 
 @contextlib.contextmanager
 def _notes_as_lines() -> Iterator[None]:
-    """Warnings, and what vestcl logs, are for the user of a command: a line each, without the place in the code."""
+    """Warnings, and what vestcl logs, are for the user of a command: a line each, without the location in the code."""
 
     def show(
         message: Warning | str,

@@ -46,7 +46,7 @@ MOST_STREET_FRAMES: Final = 10_000
 #: Steps in a table of scores, so that it fits 80 letters; forecast.json has all.
 STEPS_SHOWN: Final = 5
 
-#: Of ``learned``.
+#: Default of ``learned``.
 DEFAULT_LEARNED: Final = "tested"
 
 

@@ -34,7 +34,7 @@ _BENCHES: Final = {
 }
 
 
-#: Of each command the module and its function; it takes the command, and may return an exit code.
+#: Module and function of each command; the function takes the command, and may return an exit code.
 _COMMANDS: Final = {
     "Forecast": ("vestcl.cli.forecast", "run"),
     "Prepare": ("vestcl.cli.prepare", "run"),

@@ -103,7 +103,7 @@ class Sample(_CameraImage):
     """One frame and what is known about it. Everything is over the same field of view, at ``height`` x ``width``."""
 
     name: str
-    """Of the frame in its clip, "0000000012"."""
+    """Name of the frame in its clip, "0000000012"."""
     image: ImageSource
     K: NDArray[np.float64]
     """[3, 3] px, continuous coordinates (pixel centres at +0.5), of an image of ``size``."""

@@ -85,7 +85,7 @@ def compare(
         forecast: frames at t+1, ... with every view.
         clip: with true frames after t.
         index: of the frame t in ``clip``, 1 or more.
-        views: the cameras; those that nobody looked from are passed over.
+        views: the cameras; those from which no image was taken are skipped.
         trunk: SqueezeNet 1.0, for the squeeze distance (`vestcl.evaluation.perceptual.squeeze_distance`).
         report: is given the share of the steps that are done, 0 to 1.
         st_lpips: for ST-LPIPS (`vestcl.evaluation.perceptual.StLpips`).

@@ -23,7 +23,7 @@ MOVING: Final = 2.0
 
 
 def error_shares(truth: Truth, forecast: Forecast, index: int, view: View) -> dict[str, list[float]]:
-    """Of each region its share of a view's squared error, and of the pixels.
+    """Each region's share of a view's squared error, and of the pixels.
 
     share_r = sum_(p in r) |I(p) - T(p)|^2 / sum_p |I(p) - T(p)|^2, at the size that is scored. Regions are the
     forecast's own: by its coverage, depth and motion.

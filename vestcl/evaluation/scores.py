@@ -74,7 +74,7 @@ class Record:
     clip: str
     frame: str
     index: int
-    """Of the current frame t in the clip."""
+    """Index of the current frame t in the clip."""
     view: str
     method: str
     seconds: float
@@ -279,7 +279,7 @@ def _looks(pictures: Iterable[NDArray[np.float32]], known: Mapping[int, Look], t
 
 
 def _scores(looks: Sequence[Look], wanted: Look, seen: torch.Tensor, truth: Truth) -> dict[str, torch.Tensor]:
-    """Of M images, all metrics that the size allows, [M] each."""
+    """All metrics of M images that the size allows, [M] each."""
     pictures = torch.cat([each.picture for each in looks])
     target = wanted.picture.expand_as(pictures)
     side = min(pictures.shape[2:])

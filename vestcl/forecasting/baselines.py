@@ -32,10 +32,10 @@ def flow_extrapolation(
 ) -> torch.Tensor:
     """I_(t+k)(p) = I_t(p + b_k(p)) with the motion b_k from t+k back to t at constant velocity.
 
-    f(p) is the flow from t to t-1 (OpenCV's DIS), divided by ``elapsed``. The flow at each place of the image stays
+    f(p) is the flow from t to t-1 (OpenCV's DIS), divided by ``elapsed``. The flow at each position of the image stays
     constant: b_1 = f, b_(k+1)(p) = b_k(p) + f(p + b_k(p)), a streamline followed backwards. Nothing is left empty. That
-    holds where a camera drives through a static scene, as what comes to a place of the image next is about as deep as
-    what is there now, and it is right to second order there.
+    holds where a camera drives through a static scene, as what comes to a position of the image next is about as deep
+    as what is there now, and it is right to second order there.
 
     Where p + b_k(p) is outside the image, its border is repeated.
 

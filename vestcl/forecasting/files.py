@@ -66,7 +66,7 @@ class Details:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """What was asked for; anything that JSON holds, and paths."""
     scores: Mapping[str, Any] | None = None
-    """Of each view whose truth is known: method -> a list over steps of metric -> number."""
+    """Scores of each view with known truth: method -> a list over steps of metric -> number."""
     sheets: Mapping[str, Picture] = field(default_factory=dict)
     """By view, [H, W, 3] uint8."""
 
@@ -175,7 +175,7 @@ def read_forecast(out: str | Path) -> SavedForecast:
     try:
         about = json.loads(read_bytes(path))
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: is no JSON ({error})") from error
+        raise ValueError(f"{path}: is not JSON ({error})") from error
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise ValueError(f"{path}: must have the format {FORMAT!r}; write the forecast again")
     views = [

@@ -61,7 +61,7 @@ class LearnedPart(NamedTuple):
     why: str
     """ "29.31 dB at frame 0000000012 with it, 29.02 dB without"."""
     psnr: float | None = None
-    """Of the frame that it was tested on, forecast with the part, dB; None where it was not tested."""
+    """PSNR of the tested frame, forecast with the part, dB; None where it was not tested."""
     psnr_without: float | None = None
     """The same without it."""
 

@@ -94,7 +94,7 @@ def seen_by(view: View, sample: Sample) -> Sample | RightCamera | None:
         sample: of the time in question.
 
     Returns:
-        ``sample`` itself, its right camera at the sample's size, or None: nobody looked from there.
+        ``sample`` itself, its right camera at the sample's size, or None if there is no camera there.
     """
     at_source = np.array_equal(view.tgt_from_next, np.eye(4))
     if at_source and (view.K is None or np.array_equal(view.K, sample.K)):

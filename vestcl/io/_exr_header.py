@@ -33,7 +33,7 @@ class ExrPart:
     compression: int
     tiled: bool
     end: int
-    """Of its header, a position in the file."""
+    """End of the header, a position in the file."""
 
 
 def read_parts(content: bytes) -> list[ExrPart]:

@@ -28,7 +28,7 @@ _KINDS: Final = {
 #: A temporary file's name: hidden, the stem wanted, process and random number, the suffix wanted.
 _TEMPORARY: Final = re.compile(r"\..*\.(\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
 
-#: Seconds after which a temporary file that nobody locks is a leftover, though a process has the number in its name:
+#: Seconds after which a temporary file without a lock is a leftover, though a process has the number in its name:
 #: numbers are used again, and a writer that renames a file of its own into place drops the lock.
 _FORGOTTEN: Final = 3600.0
 

@@ -8,7 +8,7 @@ from vestcl.io.atomic import LARGEST, read_bytes
 
 
 class JsonError(ValueError):
-    """Why a text is no JSON."""
+    """Why a text is not JSON."""
 
 
 def parse_json(content: bytes) -> Any:
@@ -41,7 +41,7 @@ def read_object(path: Path, largest: int = LARGEST, wanted: str = "an object") -
     try:
         content = parse_json(read_bytes(path, largest))
     except JsonError as error:
-        raise ValueError(f"{path}: is no JSON ({error})") from error
+        raise ValueError(f"{path}: is not JSON ({error})") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path}: must be {wanted}, got {type(content).__name__}")
     return content

@@ -132,7 +132,7 @@ class Forecaster(
             perceive: for "feedback", (image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W])
                 -> layers of that forecast frame; None is `perceive_forecast`.
             prior: motion that was measured, for models that start from it and no others; with "feedback" later steps
-                go on at the motion that the first one forecast, which is not corrected again.
+                continue with the motion that the first one forecast, which is not corrected again.
             own: [B, 1, H, W], 1 where the recording car itself is in the images, which EMF's attention and mean leave
                 out; it stays there in later frames. None is nowhere.
             shown: steps k to show, of 1 ... steps; None shows all.

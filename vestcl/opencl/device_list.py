@@ -48,7 +48,7 @@ def all_devices() -> tuple[tuple[DeviceInfo, cl.Device], ...]:
     for p, platform in enumerate(platforms):
         try:
             devices = platform.get_devices()
-        except cl.Error:  # a platform without devices (rusticl without RUSTICL_ENABLE) is no reason to fail
+        except cl.Error:  # a platform without devices (rusticl without RUSTICL_ENABLE) is not an error
             continue
         for d, device in enumerate(devices):
             if pocl_cpu.is_unnamed(platform.version, device.version):

@@ -2,7 +2,7 @@
 
 Python raises what a signal handler raises (KeyboardInterrupt) between any two bytecodes: also after ``__enter__`` has
 taken a lock but before the ``with`` statement is set up, and at the first bytecode of ``__exit__``, where no ``try``
-helps. Like a robust mutex of POSIX, this lock therefore notices that its holder is gone, and the next one takes it.
+helps. Like a robust mutex of POSIX, this lock therefore notices that its holder has ended, and the next one takes it.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from typing import Any, Final
 
 Exit = Callable[[type[BaseException] | None, BaseException | None, TracebackType | None], None]
 
-#: Seconds after which a waiting thread looks whether the holder is gone; a holder that releases wakes it at once.
+#: Seconds after which a waiting thread looks whether the holder has ended; a holder that releases wakes it at once.
 _POLL: Final = 0.05
 
 
@@ -64,7 +64,7 @@ def _by_hand() -> bool:
 class Holder(WithBlock):
     """A ``with`` block that takes a `RobustLock`."""
 
-    #: Of the block: threading.get_ident().
+    #: Thread of the block: threading.get_ident().
     thread = 0
     _turn: "queue.SimpleQueue[None] | None" = None
 

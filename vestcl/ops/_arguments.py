@@ -40,7 +40,7 @@ def check_arguments(**arguments: tuple[Any, str]) -> dict[str, int]:
         letter -> size.
 
     Raises:
-        ValueError: a value is no dense float32 or float64 torch CPU tensor or NumPy array, is of another kind or
+        ValueError: a value is not a dense float32 or float64 torch CPU tensor or NumPy array, is of another kind or
             dtype than the first one, does not fit its shape, or is differentiated as in `require_ordinary`.
     """
     first = next(iter(arguments))

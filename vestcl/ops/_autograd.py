@@ -16,7 +16,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 Gradients = tuple[torch.Tensor | None, ...]
-"""Of all inputs of an operator; None where no gradient is needed."""
+"""Gradients of all inputs of an operator; None where no gradient is needed."""
 
 _NOT_TRACED: Final = "vestcl's operators run OpenCL kernels outside the graph: leave out fullgraph=True"
 

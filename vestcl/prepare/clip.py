@@ -269,7 +269,7 @@ def _version(path: Path) -> tuple[int, int]:
 
 @functools.lru_cache(maxsize=1)
 def _file_digest(path: Path, size: int, changed: int) -> bytes:
-    """Of a file that many frames share."""
+    """Digest of a file that many frames share."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK):

@@ -50,7 +50,8 @@ _ORDER: Final = (*ALWAYS, "prev_from_cur", "right")
 #: In a shape: any number.
 _ANY: Final = -1
 
-#: Of clip.json: the CRC-32 of its other entries. Files of vestcl 0.3 and before have these entries and no checksum.
+#: Entry of clip.json: the CRC-32 of its other entries. Files of vestcl 0.3 and before have these entries and no
+#: checksum.
 _CHECKSUM: Final = "checksum"
 _INPUTS: Final = "inputs"
 _UNCHECKED: Final = frozenset(("recipe", "name", "kind", "fps", "size", "frames"))

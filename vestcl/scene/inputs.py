@@ -35,7 +35,7 @@ class Inputs:
     depth: str
     masks: str
     motion: str
-    """Of the camera, up to t."""
+    """Source of the camera's motion up to t."""
     inpainting: str
     stereo: bool = False
     """Whether a depth is matched against the right camera's image at the same time."""
@@ -84,7 +84,7 @@ def inputs_of(
 
 
 def is_stereo(clip: Clip) -> bool:
-    """Whether a frame's depth is matched in its stereo pair: by vestcl, for want of another, or in its file."""
+    """Whether a frame's depth is matched in its stereo pair: by vestcl, without another source, or in its file."""
     return any(is_matched(sample) or _is_pair(sample) for sample in clip)
 
 

@@ -20,14 +20,14 @@ _EDGE, _STATIC = 0.015, 0.25
 #: What crossing a column costs where no static edge is, where the bonnet is out of the image, and a step of a row.
 _NO_EDGE, _OUTSIDE, _STEP, _FARTHEST = 1.0, 0.7, 0.1, 2
 
-#: Of several edges the upper one is the rim, others are reflections: a whole height costs that. Notches of the rim up
+#: The upper one of several edges is the rim, others are reflections: a whole height costs that. Notches of the rim up
 #: to that share of the width are closed.
 _LOW, _NOTCH = 1.0, 0.2
 
 #: The bonnet's rim must be seen in so much of the width, and be a static edge in so much of that.
 _WIDE, _EDGES = 0.5, 0.7
 
-#: Of the edges below the rim this many are static, of those above, up to the horizon, at most this many.
+#: This share of the edges below the rim is static, and at most this share of those above, up to the horizon.
 _BELOW, _ABOVE = 0.2, 0.3
 
 #: Below a border row no bonnet is seen: it has that many rows at least, as a share of the height.

@@ -77,7 +77,7 @@ class Perception(Measurements):
         """The frame's layers, velocities and camera motion.
 
         Raises:
-            ValueError: a file missing or damaged, or no depth to be had.
+            ValueError: a file missing or damaged, or no source of depth.
         """
         return self.once("layers", index, lambda: self._see(index))
 

@@ -172,7 +172,7 @@ def read_lines(path: Path) -> list[str]:
     """The lines of a text file that are not blank.
 
     Raises:
-        ValueError: it can't be read, or is no text.
+        ValueError: it can't be read, or is not text.
     """
     return list(numbered_lines(path).values())
 
@@ -181,12 +181,12 @@ def numbered_lines(path: Path) -> dict[int, str]:
     """The lines of a text file that are not blank, by their number in the file, from 1.
 
     Raises:
-        ValueError: it can't be read, or is no text.
+        ValueError: it can't be read, or is not text.
     """
     try:
         text = read_bytes(path, _LARGEST_TEXT).decode("utf-8")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: is no text") from error
+        raise ValueError(f"{path}: is not text") from error
     return {number: line for number, line in enumerate(text.splitlines(), start=1) if line.strip()}
 
 
@@ -262,7 +262,7 @@ def _refuse_blank(path: Path, lines: Mapping[int, str]) -> None:
 
 
 class Calibration:
-    """A KITTI calibration file, lines of `name: numbers`; lines whose words are no numbers (dates) are passed over."""
+    """A KITTI calibration file, lines of `name: numbers`; lines whose words are no numbers (dates) are skipped."""
 
     def __init__(self, path: Path) -> None:
         """Read ``path``.

@@ -24,7 +24,7 @@ from vestcl.io.atomic import read_bytes
 from vestcl.io.depth import KITTI_UNITS
 from vestcl.io.images import image_size
 
-#: Of the sphere that KITTI's Mercator projection is on, metres.
+#: Radius of the sphere of KITTI's Mercator projection, metres.
 EARTH_RADIUS: Final = 6378137.0
 
 #: Numbers in a line of oxts: latitude, longitude, altitude, roll, pitch, yaw and 24 more.

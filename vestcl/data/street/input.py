@@ -30,7 +30,7 @@ USUAL_RATE: Final = 10.0
 #: With random driving, a street's clip starts somewhere in its first minute, so that all phases of its sway come up.
 STARTS: Final = (0.0, 60.0)
 
-#: Of the random numbers of a street.
+#: Streams of the random numbers of a street.
 _DRIVE, _START, _RATE, _DEPTH, _MASKS, _BEAMS = range(1, 7)
 
 _PATTERN: Final = re.compile(r"street:(?:(\d{1,18})(?:-(\d{1,18}))?)?(?:\?(.*))?")

@@ -145,7 +145,7 @@ class Scene:
     kerb: float
     """From the centre line to the kerb, metres."""
     seed: int
-    """Of the road's and the sky's texture."""
+    """Seed of the road's and the sky's texture."""
     course: NDArray[np.void] | None = None
     """An array [n] of dtype COURSE, n > 0, COURSE_STEP apart: of a bent street its middle line, placed from the camera;
     ``crossings`` are along it. None is straight: x = 0, along z."""

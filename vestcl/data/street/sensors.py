@@ -31,7 +31,7 @@ LOST: Final = 0.1
 MISSED: Final = 0.08
 OUTLINE: Final = 2.5
 
-#: Of the random numbers, by sensor.
+#: Streams of random numbers, by sensor.
 _SCAN, _CLASSES = 60, 61
 
 
@@ -42,7 +42,7 @@ class StreetScan:
     shot: Shot
     beams: int
     index: int
-    """Of the frame: its noise is its own."""
+    """Index of the frame, which has its own noise."""
 
     def read(self) -> NDArray[np.float32]:
         """[1, H, W] m, valid iff > 0: of each return the z-depth in the pixel that it falls in."""
@@ -78,7 +78,7 @@ class DisturbedLabels:
 
     shot: Shot
     index: int
-    """Of the frame: its errors are its own."""
+    """Index of the frame, which has its own errors."""
 
     def read(self) -> NDArray[np.uint8]:
         """[1, H, W] Cityscapes train ids. A connected region of one foreground class counts as an instance."""

@@ -48,7 +48,7 @@ class _Recipe(NamedTuple):
     taps: tuple[int, ...]
     """Layers of ``features`` whose output is taken."""
     channels: tuple[int, ...]
-    """Of each map taken."""
+    """Channels of each map taken."""
     side: int
     """The smallest image side that leaves a pixel on the last map."""
     file: str

@@ -46,7 +46,7 @@ _TRUSTED, _FEWEST = 0.5, 100
 #: left it below is passed.
 _REACH: Final = (3.0, 1.25)
 
-#: Metres; nearer points have no place in an image.
+#: Metres; nearer points are not in an image.
 _NEAREST: Final = 0.5
 
 Array = NDArray[np.float32]

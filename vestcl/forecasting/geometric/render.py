@@ -31,11 +31,11 @@ _OPAQUE: Final = 0.5
 #: Less coverage than that is a hole.
 HOLE: Final = 0.05
 
-#: In a pixel of one surface, the place where its own surface was seen is no farther than that from their mean, px.
+#: In a pixel of one surface, the position where its own surface was seen is no farther than that from their mean, px.
 #: Elsewhere colours are mixed.
 _EXTRAPOLATED: Final = 2.0
 
-#: OpenCV looks up places in rows of fewer than 32,768.
+#: OpenCV looks up positions in rows of fewer than 32,768.
 _ROW: Final = 1024
 
 

@@ -39,7 +39,7 @@ class Decoder:
         self._open()
 
     def frame(self, index: int) -> VideoFrame:
-        """Frame ``index`` of the list: a kept one, or by going on, or from the key frame before it.
+        """Frame ``index`` of the list: a kept one, or by continuing to decode, or from the key frame before it.
 
         Raises:
             ValueError: the file is damaged there.
@@ -82,11 +82,11 @@ class Decoder:
         return max(int(np.searchsorted(self._frames.keys[:, 0], pts, side="right")) - 1, 0)
 
     def _is_ahead(self, index: int) -> bool:
-        """Whether going on leads to frame ``index`` sooner than going to a key frame."""
+        """Whether continuing to decode reaches frame ``index`` sooner than going to a key frame."""
         return self._last < index and (index - self._last <= KEPT or self._number(self._key(index)) <= self._last)
 
     def _number(self, key: int) -> int:
-        """Of the key frame in the list; 0 for the first."""
+        """Number of the key frame in the list; 0 for the first."""
         return int(np.searchsorted(self._frames.pts, self._frames.keys[key, 0])) if key else 0
 
     def _decode_from(self, key: int, index: int) -> bool:
@@ -133,7 +133,7 @@ class Decoder:
 
 
 def _decode(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
-    """Frames from where the container is on; packets that can't be decoded are passed over."""
+    """Frames from where the container is on; packets that can't be decoded are skipped."""
     with contextlib.suppress(av.FFmpegError):
         for packet in container.demux(stream):
             if not packet.size:

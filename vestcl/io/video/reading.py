@@ -27,7 +27,7 @@ class Video:
 
     path: Path
     frames: int
-    """Of those that are shown: not what an edit list cuts away, nor what comes before the first key frame."""
+    """Number of frames that are shown: without those that an edit list cuts or that precede the first key frame."""
     seconds: NDArray[np.float64]
     """[frames] presentation times since the first frame, increasing."""
     fps: float

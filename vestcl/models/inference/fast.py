@@ -34,7 +34,8 @@ Precision = Literal["float32", "bfloat16"]
 #: oneDNN computes in float32, and bfloat16 costs conversions on top.
 _BFLOAT16: Final = ("avx512_bf16", "amx_bf16", "avx_ne_convert", "bf16")
 
-#: Of glibc's mallopt: no separate memory maps for large blocks, nothing given back below 2 GiB; glibc's defaults.
+#: Settings of glibc's mallopt: no separate memory maps for large blocks, nothing given back below 2 GiB; glibc's
+#: defaults.
 _MALLOPT: Final = {True: ((-4, 0), (-1, 2**31 - 1)), False: ((-4, 65536), (-1, 128 * 1024))}
 
 

@@ -21,7 +21,7 @@ Quality = Literal["exact", "balanced", "fast"]
 #: The levels, best first.
 LEVELS: Final[tuple[Quality, ...]] = get_args(Quality)
 
-#: Of `vestcl forecast`: its loss of quality is not visible.
+#: Default of `vestcl forecast`: its loss of quality is not visible.
 USUAL: Final[Quality] = "balanced"
 
 #: The largest PSNR drop of a level against "exact" to the true next frame, dB, mean over streets.

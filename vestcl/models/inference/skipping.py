@@ -18,7 +18,7 @@ _WHOLE: Final = 0.6
 
 
 class Count(NamedTuple):
-    """Of one switch."""
+    """Counts of one switch."""
 
     skipped: int
     of: int
@@ -60,7 +60,7 @@ def count_skips() -> Iterator[Tally]:
 
 
 def current_tally() -> Tally:
-    """The tally of the thread's `count_skips`; outside of one, a tally that nobody reads."""
+    """The tally of the thread's `count_skips`; outside of one, a tally that is not read."""
     return _tally.get() or Tally()
 
 

@@ -31,7 +31,7 @@ INTERVAL: Final = 0.1
 MEASURED: Final = 4
 RATES: Final = 7
 
-#: Of a small motion: rotation vector and translation.
+#: Numbers of a small motion: rotation vector and translation.
 NUMBERS: Final = 6
 
 #: Rates of rotation, rad/s, and velocities, m/s, are shown to the network times that.
@@ -61,7 +61,7 @@ class CameraPrior(NamedTuple):
 
     @property
     def intervals(self) -> int:
-        """Of how many the motion is known."""
+        """Number of intervals whose motion is known."""
         return 1 if self.later is None else 1 + self.later.translation.shape[1]
 
     @property

@@ -36,7 +36,7 @@ _ROLLING: Final = 0.5
 #: No motion: the quaternion (1, 0, 0, 0) and the translation 0.
 _REST: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
-#: Of a small motion: rotation vector and translation.
+#: Numbers of a small motion: rotation vector and translation.
 _NUMBERS: Final = 6
 
 

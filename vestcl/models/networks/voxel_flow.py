@@ -25,7 +25,7 @@ from torch.nn import functional
 from vestcl.io import atomic
 from vestcl.models.weights_file import check_finite, misfit, read_state_dict
 
-#: Of the nine blocks: each sees the frames at 1 / S of their size next to a narrow branch at full size.
+#: Scales of the nine blocks: each sees the frames at 1 / S of their size next to a narrow branch at full size.
 SCALES: Final = (4, 4, 4, 2, 2, 2, 1, 1, 1)
 
 #: Channels of a block by its scale.

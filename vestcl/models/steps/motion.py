@@ -60,7 +60,7 @@ class Step(NamedTuple):
     views: list[RenderedView]
     """One for each camera asked for; none at steps that are not shown."""
     motion: Motion
-    """Of the interval before t + k; when motion is composed, all but the camera's is that of the first interval."""
+    """Motion of the interval before t + k; composed motion repeats that of the first interval, except the camera's."""
     future_from_cur: torch.Tensor
     """[B, 4, 4] m: from the camera at t to the camera at t + k."""
     path_from_cur: torch.Tensor
@@ -68,7 +68,7 @@ class Step(NamedTuple):
 
 
 def next_prior(prior: MotionPrior, motion: Motion, seen: RenderedView, K: torch.Tensor) -> MotionPrior:
-    """Of the step after ``motion``, from which the source camera has ``seen`` the result.
+    """The prior of the step after ``motion``, from which the source camera has ``seen`` the result.
 
     It is the networks' own forecast and not corrected again: they learned what a measured motion lacks, and would add
     that in every step.

@@ -96,7 +96,7 @@ def _planes(prev: EncodedFrame, cur: EncodedFrame, inpainted: bool) -> tuple[lis
 
 
 class _Piece(NamedTuple):
-    """Of the image: what OMF is not shown of it, and what it may change."""
+    """A piece of the image: what OMF does not see of it, and what it may change."""
 
     box: Box
     beyond: torch.Tensor

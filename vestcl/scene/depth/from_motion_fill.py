@@ -27,7 +27,7 @@ _SMALLEST: Final = 0.0006
 #: A region that fills that share of its convex hull is taken to be one object, a car, with holes in its flow.
 _SOLID: Final = 0.6
 
-#: Of an object's columns, sorted by the depth of their feet, the one that the whole object takes.
+#: The column, of an object's columns sorted by the depth of their feet, whose depth the whole object takes.
 _FOOT: Final = 0.6
 
 #: Above an object, up to that many camera heights over the camera and down to that share of its foot's depth, its roof

@@ -61,7 +61,7 @@ class Description:
     """A description, with its defaults."""
 
     path: Path
-    """Of the ONNX file."""
+    """Path of the ONNX file."""
     given: bool
     """Whether there is a JSON."""
     meaning: str

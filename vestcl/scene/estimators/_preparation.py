@@ -42,7 +42,7 @@ class Preparation:
     round_up: bool
     """Whether to the next multiple, not to the nearest."""
     mode: str
-    """Of torch's interpolate."""
+    """Mode of torch's interpolate."""
     gain: float
     mean: tuple[float, ...]
     std: tuple[float, ...]

@@ -191,7 +191,7 @@ def _scores(network: OnnxNetwork, result: NDArray[Any], count: int) -> NDArray[n
 
 
 def _class_count(network: OnnxNetwork) -> int:
-    """Of a network whose JSON has but ``movable`` and ``sky``: the size of its axis of classes."""
+    """The size of the axis of classes of a network whose JSON has only ``movable`` and ``sky``."""
     shape = network.output_shape[1:] if len(network.output_shape) == 4 else network.output_shape
     if len(shape) != 3:
         raise ValueError(

@@ -46,7 +46,7 @@ class EstimatedFrame(Generic[Element]):
     frame: int
     kept: _Kept[Element]
     metric: bool = True
-    """Of depth: whether it is in metres."""
+    """Whether depth is in metres."""
 
     def read(self) -> NDArray[Element]:
         """[1, H, W] at the image's own size: metres, or train ids."""

@@ -1,4 +1,4 @@
-"""What nobody has seen: holes of a view, filled smoothly from what surrounds them, and at the sides with structure."""
+"""Disoccluded regions: holes of a view, filled smoothly from what surrounds them, and at the sides with structure."""
 
 from typing import Final
 
@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from vestcl.scene.inpainting.sides import carry_on
 
-#: Surroundings count by 1 / (1/z + that)^2, 1/m: what was hidden is likelier to go on behind a hole than what hid it.
+#: Surroundings count by 1 / (1/z + that)^2, 1/m: what was hidden is more likely to continue behind a hole than what hid
+#: it.
 _FAR: Final = 0.01
 
 #: OpenCV resizes up to this many channels at once.
@@ -68,7 +69,7 @@ def deep_holes(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _at_border(hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The holes [H, W] that reach the image's border: nobody hid them, they were out of sight."""
+    """The holes [H, W] that reach the image's border: they were out of sight, not hidden."""
     count, labels = cv2.connectedComponents(hole.astype(np.uint8))
     at_border = np.zeros(count, bool)
     for side in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):

@@ -12,7 +12,7 @@ from vestcl.scene.flow.correspondence import sample
 #: that the ragged edge of a hole is not extended.
 _SMOOTH, _WIDTH = 9, 832
 
-#: The share of what is carried on falls to 1/e at that distance into the hole, over the distance of its edge from the
+#: The share of what is extrapolated falls to 1/e at that distance into the hole, over the distance of its edge from the
 #: vanishing point.
 _DECAY: Final = 0.5
 

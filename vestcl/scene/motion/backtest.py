@@ -72,8 +72,8 @@ class BacktestFrame(NamedTuple):
 def residual_flow(frame: BacktestFrame) -> Array:
     """r [2, H, W] px per interval, forward: what flow shows beyond the camera's motion, (p' - (p + flow)) / elapsed.
 
-    p' is where the point would have been in the frame before at rest. 0 where the difference is no motion but a wrong
-    match.
+    p' is where the point would have been in the frame before at rest. 0 where the difference is a wrong match, not
+    motion.
     """
     there = _brought(frame, frame.prev_from_cur)
     residual = (_pixels(there) - moved_pixels(frame.flow_uv)) / frame.elapsed
@@ -87,7 +87,7 @@ def candidates(
     """Where each pixel's point may be after ``ahead`` intervals.
 
     The candidates: its object's velocity; rest in the world; rest and ``ahead`` times the residual flow r; rest and r
-    followed from place to place, as objects that come to the end of where r was seen slow down in the mean. With
+    followed from position to position, as objects that come to the end of where r was seen slow down in the mean. With
     ``by_flow`` also, last, flow itself, p - ahead flow / elapsed: it knows of no depth, which may be far off where it
     comes from motion.
 
@@ -154,7 +154,8 @@ def by_step(errors: Sequence[Array], by_flow: bool = False) -> tuple[Array, ...]
 
     Those of candidates by flow are raised by `_FLOW_MARGIN`.
     Flow itself, with ``by_flow`` the last candidate, has its errors raised if it was worse than another over the whole
-    image in any test: by chance it does as well in places, and it forecasts what comes nearer worse with every step.
+    image in any test: by chance it does as well in some regions, and it forecasts what comes nearer worse with every
+    step.
 
     Args:
         errors: of `backtest`, over one frame, over two ...

@@ -1,4 +1,4 @@
-"""Banks of linear models of motion, filtered side by side and weighted by how well each forecast what came.
+"""Banks of linear models of motion, filtered side by side and weighted by how well each forecast what was measured.
 
 A model is a linear stochastic system, dx = A x dt + noise of spectral density Q, of which increments are measured:
 y = integral of C x over the interval + noise of standard deviation r. Its Kalman filter forecasts each measurement

@@ -38,7 +38,7 @@ _GAIN: Final = 1.5
 #: Pixels of an object that take part, evenly chosen: neighbours say the same.
 _PIXELS: Final = 3000
 
-#: Residual flow beyond this many pixels is no motion but a wrong match, and below this many it is noise.
+#: Residual flow beyond this many pixels is a wrong match, not motion, and below this many it is noise.
 _LARGEST, _NOISE = 40.0, 0.2
 
 #: Up to that share of believed flow around a pixel nothing is corrected, from that one on everything: bare asphalt has
@@ -149,11 +149,11 @@ def follow_flow(
     prev_from_cur: NDArray[np.float64],
     K: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """``velocity`` corrected, at constant depth, by what flow shows beyond it: v - z' K^-1 r, as far as r is no noise.
+    """``velocity`` corrected, at constant depth, by what flow shows beyond it: v - z' K^-1 r, as far as r is not noise.
 
     r = p + flow(p) - project(K (R (x - v) + t)), smoothed up to the image's edges and shrunk by the error of flow:
-    r max(0, 1 - NOISE^2 / |r|^2). Shadows that travel with a car, bodies that bend and errors of depth go on as they
-    did, too.
+    r max(0, 1 - NOISE^2 / |r|^2). Shadows that travel with a car, bodies that bend and errors of depth continue as
+    before, too.
 
     Args:
         velocity: [3, H, W] m per frame.

@@ -47,7 +47,7 @@ _AROUND: Final = np.array([[x, z] for x in (-1.0, 0.0, 1.0) for z in (-1.0, 0.0,
 #: Pixels of an object that take part in the search and in what decides, evenly chosen. With fewer nothing is searched.
 _SEARCHED, _COMPARED, _FEWEST = 300, 1500, 30
 
-#: Of an object's pixels this many must have been inside the frame before.
+#: This many of an object's pixels must have been inside the frame before.
 _INSIDE: Final = 0.5
 
 #: Differences are averaged over windows of this many pixels, then up to edges and over superpixels of that area.

@@ -50,7 +50,7 @@ REACH: Final = 2048
 _NODES: Final = (1 + np.polynomial.legendre.leggauss(4)[0]) / 2
 _WEIGHTS: Final = np.polynomial.legendre.leggauss(4)[1] / 2
 
-#: Of the random numbers: one stream for each direction.
+#: Streams of random numbers: one for each direction.
 _PURPOSE: Final = 40
 
 #: Newton's steps to the nearest point of a course.

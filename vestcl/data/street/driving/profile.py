@@ -29,7 +29,7 @@ BUMP_HEIGHT: Final = 0.02
 #: Track of a compact car, metres.
 TRACK: Final = 1.55
 
-#: Of the random numbers of a road.
+#: Stream of the random numbers of a road.
 _PROFILE, _BUMPS = 51, 52
 
 

@@ -81,7 +81,7 @@ SETTLING: Final = 8.0
 GRID: Final = 2.0
 PREVIEW: Final = 300.0
 
-#: Of the random numbers of a drive.
+#: Purpose of the random numbers of a drive.
 _EVENTS, _WANDER, _DRAWN = 50, 53, 54
 
 
@@ -91,7 +91,7 @@ class RoadDrive:
 
     course: Course
     seed: int
-    """Of stops, of the road's profile and of the wander in the lane."""
+    """Seed of stops, of the road's profile and of the wander in the lane."""
     speed: float
     """Desired on straights, m/s."""
     acceleration: float
