@@ -9,8 +9,7 @@
 //
 // Few points take fewer launches, see splat_bin_few.cl.
 //
-//   TOGETHER   defined: sort_tiles_together, a work-group per tile (for GPUs), instead of sort_tiles, a work-item per
-// tile
+//   TOGETHER   defined: sort_tiles_together, one work-group per tile (for GPUs), instead of sort_tiles
 #include "common.h"
 #include "splat.h"
 #include "prefetch.h"

@@ -79,8 +79,7 @@ kernel void composite_tiles(
 #if TRUNCATE
   tile_traversed[index] = pack_traversed(end - begin, finite);
 #else
-  // What lies behind the fragment that made a pixel opaque affects that fragment's gradient: the backward traverses
-  // all.
+  // What lies behind the fragment that made a pixel opaque affects its gradient: the backward traverses all.
   const int entries = tile_starts[index + 1] - begin;
   tile_traversed[index] = pack_traversed(entries, finite && entries == end - begin);
 #endif

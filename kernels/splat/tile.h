@@ -1,5 +1,5 @@
-// How a work-item traverses one tile: in quads of 2 x 2 pixels, the lanes of a vector of four. After splat.h,
-// channels.h.   TRUNCATE   1: a pixel takes no more fragments once T < min_transmittance; 0: it takes all
+// Traversal of one tile by a work-item: in quads of 2 x 2 pixels, the lanes of a vector of four. After channels.h.
+//   TRUNCATE   1: a pixel takes no more fragments once T < min_transmittance; 0: it takes all
 #ifndef TRUNCATE
 #error "define TRUNCATE as 0 or 1"
 #endif

@@ -24,8 +24,8 @@ def test_does_the_whole_job(model: str, tmp_path: Path, capsys: pytest.CaptureFi
         files = sorted(path.name for path in (out / view).iterdir())
         assert {"000001.png", "000003.png", "000003.exr", "forecast.mp4"} <= set(files)
         assert str(out / view) in said
-    with Image.open(out / "sheet.png") as picture:
-        assert picture.size[0] > 3 * 300
+    with Image.open(out / "sheet.png") as image:
+        assert image.size[0] > 3 * 300
     scores = about["scores"] if "scores" in about else about["metrics"]
     for view in ("source", "right", "beside"):
         of = {method: np.mean([step["psnr"] for step in steps]) for method, steps in scores[view].items()}

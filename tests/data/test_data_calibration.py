@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_files import picture, pose, row, write_images, write_text
+from data_files import noise_image, pose, row, write_images, write_text
 
 from vestcl import io
 from vestcl.data import calibration
@@ -113,10 +113,10 @@ def test_numbered_images(tmp_path: Path) -> None:
     assert files.numbered_images(tmp_path / "nowhere") == {}
     with pytest.raises(ValueError, match=r"rgb_00009\.jpg: must be named by its number, as 000000\.jpg"):
         files.numbered_images(tmp_path / "a")
-    io.write_pixels(tmp_path / "a" / "rgb_00012.png", picture())
+    io.write_pixels(tmp_path / "a" / "rgb_00012.png", noise_image())
     with pytest.raises(ValueError, match=r"a: the frame after rgb_00010\.png is missing"):
         files.numbered_images(tmp_path / "a", "rgb_")
     assert list(files.numbered_images(tmp_path / "a", "rgb_", gaps=True)) == [9, 10, 12]
-    io.write_pixels(tmp_path / "a" / "rgb_12.png", picture())
+    io.write_pixels(tmp_path / "a" / "rgb_12.png", noise_image())
     with pytest.raises(ValueError, match=r"rgb_12\.png: has the number of rgb_00012\.png"):
         files.numbered_images(tmp_path / "a", "rgb_", gaps=True)

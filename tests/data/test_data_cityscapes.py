@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_files import picture, write_images, write_text
+from data_files import noise_image, write_images, write_text
 
 from vestcl import io
 from vestcl.data.readers.cityscapes import is_frame, open_cityscapes, snippets
@@ -55,7 +55,7 @@ def test_right_camera(tmp_path: Path) -> None:
     assert sample.right is not None
     np.testing.assert_allclose(sample.right.right_from_left[:3], np.eye(3, 4) - [[0, 0, 0, 0.209313], [0] * 4, [0] * 4])
     assert np.array_equal(sample.right.K, sample.K)
-    assert np.array_equal(sample.right.read_image(), io.to_float(picture(16, 32, 5)))
+    assert np.array_equal(sample.right.read_image(), io.to_float(noise_image(16, 32, 5)))
 
 
 @pytest.mark.parametrize("folder", ["disparity", "disparity_sequence"])

@@ -11,7 +11,7 @@ import test_data_folder
 import test_data_kitti_odometry
 import test_data_kitti_raw
 import test_data_virtual_kitti
-from data_files import picture, row, write_images, write_text
+from data_files import noise_image, row, write_images, write_text
 
 from vestcl import io
 from vestcl.data import fit
@@ -204,7 +204,7 @@ def test_cityscapes(tmp_path: Path) -> None:
     test_data_cityscapes.tree(tmp_path)
     folder = tmp_path / "leftImg8bit_sequence" / "val" / "frankfurt"
     for path in folder.iterdir():
-        io.write_pixels(path, picture(400, 1024))
+        io.write_pixels(path, noise_image(400, 1024))
     with pytest.raises(ValueError, match=r"_camera\.json: is for images of \(1024, 2048\).*cy = 513\.137 - rows cut"):
         open_sequence(tmp_path)
 
@@ -311,7 +311,7 @@ def test_maps_of_about_the_same_proportions(tmp_path: Path) -> None:
     """KITTI at 640 x 192 with depth at 1242 x 375: 0.6 % apart, 1.2 px."""
     path = test_data_folder.folder(tmp_path, depth_scale=256, fx=371.8, fy=369.4, cx=313.9, cy=88.3)
     for name in "abc":
-        io.write_pixels(path / "image" / f"{name}.png", picture(192, 640))
+        io.write_pixels(path / "image" / f"{name}.png", noise_image(192, 640))
         io.write_depth(path / "depth" / f"{name}.png", np.full((375, 1242), 5.0), 256)
     assert (open_folder(path)[0].read_depth() == 5).all()
     io.write_depth(path / "depth" / "a.png", np.full((375, 1200), 5.0), 256)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from data_files import picture, pose, real, row, write_images, write_text
+from data_files import noise_image, pose, real, row, write_images, write_text
 
 from vestcl import io
 from vestcl.data.readers.folder import open_folder, read_camera
@@ -25,7 +25,7 @@ def folder(tmp_path: Path, where: str = "image", **camera: object) -> Path:
 def test_images(tmp_path: Path, where: str) -> None:
     clip = open_folder(folder(tmp_path, where))
     assert (clip.kind, clip.name, [s.name for s in clip]) == ("folder", tmp_path.name, ["a", "b", "c"])
-    assert np.array_equal(clip[1].read_image(), io.to_float(picture(seed=1)))
+    assert np.array_equal(clip[1].read_image(), io.to_float(noise_image(seed=1)))
     assert clip[0].timestamp is None and clip.fps is None
     assert clip[0].depth is None and clip[0].labels is None and clip[0].right is None
 
@@ -116,7 +116,7 @@ def test_tables_of_another_length(tmp_path: Path) -> None:
 
 def test_images_of_several_sizes(tmp_path: Path) -> None:
     path = folder(tmp_path)
-    io.write_pixels(path / "image" / "b.png", picture(7, 8))
+    io.write_pixels(path / "image" / "b.png", noise_image(7, 8))
     with pytest.raises(ValueError, match=r"b\.png: must be 6 x 8 as its clip is, got 7 x 8"):
         open_folder(path)[1].read_image()
 

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from data_files import picture, write_images, write_text
+from data_files import noise_image, write_images, write_text
 
 from vestcl import io
 from vestcl.data.lens import UndistortedImage
@@ -169,7 +169,7 @@ def test_coefficients_of_zero_change_no_bit(tmp_path: Path) -> None:
     write_images(tmp_path / "image", ["a.png"], HEIGHT, WIDTH)
     sample = open_folder(tmp_path)[0]
     assert isinstance(sample.image, ImageFile)
-    assert np.array_equal(sample.read_image(), io.to_float(picture(HEIGHT, WIDTH)))
+    assert np.array_equal(sample.read_image(), io.to_float(noise_image(HEIGHT, WIDTH)))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import test_data_folder
 import test_data_kitti_odometry
 import test_data_kitti_raw
 import test_data_virtual_kitti
-from data_files import picture, write_images, write_text
+from data_files import noise_image, write_images, write_text
 
 from vestcl import io
 from vestcl.data.open import open_sequence
@@ -43,15 +43,15 @@ def test_frames_are_in_natural_order(tmp_path: Path, where: str) -> None:
     path = folder(tmp_path, [f"frame{i}.png" for i in range(1, 13)], where)
     write_text(path / "times.txt", *(str(i / 10) for i in range(12)))
     for i in range(1, 13):
-        io.write_pixels(path / "right" / f"frame{i}.PNG", picture(seed=100 + i))
+        io.write_pixels(path / "right" / f"frame{i}.PNG", noise_image(seed=100 + i))
         io.write_depth(path / "depth" / f"frame{i}.npy", np.full((6, 8), float(i)))
     clip = open_sequence(path)
     assert [s.name for s in clip] == [f"frame{i}" for i in range(1, 13)]
     for i, sample in enumerate(clip, start=1):
-        assert np.array_equal(sample.read_image(), io.to_float(picture(seed=i - 1)))
+        assert np.array_equal(sample.read_image(), io.to_float(noise_image(seed=i - 1)))
         assert (sample.read_depth() == i / 100).all() and sample.timestamp == (i - 1) / 10
         assert sample.right is not None
-        assert np.array_equal(sample.right.read_image(), io.to_float(picture(seed=100 + i)))
+        assert np.array_equal(sample.right.read_image(), io.to_float(noise_image(seed=100 + i)))
 
 
 def test_numbers_of_any_length(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_suffixes_in_any_case(tmp_path: Path, suffixes: tuple[str, str, str]) ->
     image, depth, labels = suffixes
     path = folder(tmp_path, [f"{i}{image}" for i in range(2)])
     for i in range(2):
-        io.write_pixels(path / "right" / f"{i}{image}", picture())
+        io.write_pixels(path / "right" / f"{i}{image}", noise_image())
         io.write_depth(path / "depth" / f"{i}{depth}", np.full((6, 8), 3.0), 100)
         io.write_pixels(path / "labels" / f"{i}{labels}", np.full((6, 8), 13, np.uint8))
     for clip in (
@@ -122,7 +122,7 @@ def test_suffixes_of_the_data_sets(tmp_path: Path) -> None:
 def test_two_files_of_one_name(tmp_path: Path, kind: str) -> None:
     path = folder(tmp_path, ["0.png", "1.png"])
     for name in ("0.png", "1.png"):
-        io.write_pixels(path / "right" / name, picture())
+        io.write_pixels(path / "right" / name, noise_image())
         io.write_depth(path / "depth" / name, np.full((6, 8), 3.0), 100)
         io.write_pixels(path / "labels" / name, np.full((6, 8), 13, np.uint8))
     assert len(open_folder(path)) == 2
@@ -218,7 +218,7 @@ def test_what_is_no_image(tmp_path: Path, kind: str, what: str) -> None:
     """The second frame's: opening may pass, reading says it; nothing blocks."""
     path = folder(tmp_path, ["0.png", "1.png"])
     for name in ("0.png", "1.png"):
-        io.write_pixels(path / "right" / name, picture())
+        io.write_pixels(path / "right" / name, noise_image())
         io.write_depth(path / "depth" / name, np.full((6, 8), 3.0), 100)
         io.write_pixels(path / "labels" / name, np.full((6, 8), 13, np.uint8))
     bad = path / kind / "1.png"

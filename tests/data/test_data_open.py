@@ -10,7 +10,7 @@ import test_data_folder
 import test_data_kitti_odometry
 import test_data_kitti_raw
 import test_data_virtual_kitti
-from data_files import picture, real, write_text
+from data_files import noise_image, real, write_text
 from video_files import write_video
 
 from vestcl import io
@@ -19,7 +19,7 @@ from vestcl.data.readers.video import open_video
 
 
 def movie(tmp_path: Path) -> Path:
-    io.write_mp4(tmp_path / "drive.mp4", [picture(32, 64, i) for i in range(5)], 12.5)
+    io.write_mp4(tmp_path / "drive.mp4", [noise_image(32, 64, i) for i in range(5)], 12.5)
     return tmp_path / "drive.mp4"
 
 
@@ -104,7 +104,7 @@ def test_video(tmp_path: Path) -> None:
 @pytest.mark.parametrize("degrees", [0, 90])
 def test_a_video_with_oblong_pixels(tmp_path: Path, degrees: int) -> None:
     """fy / fx is a pixel's width over its height; turned by a quarter, its height over its width. A resize scales."""
-    frames = [picture(32, 64, i) for i in range(3)]
+    frames = [noise_image(32, 64, i) for i in range(3)]
     clip = open_video(write_video(tmp_path / "a.mp4", frames, aspect=Fraction(5, 3), degrees=degrees), fov=90)
     height, width, aspect = (64, 32, 3 / 5) if degrees else (32, 64, 5 / 3)
     expected = np.array([[width / 2, 0, width / 2], [0, aspect * width / 2, height / 2], [0, 0, 1]])

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from data_files import picture, pose
+from data_files import noise_image, pose
 
 from vestcl import io
 from vestcl.data.calibration import intrinsics, translation
@@ -22,7 +22,7 @@ K = intrinsics(70.0, 72.0, 4.25, 3.5)
 def sample(**changes: object) -> Sample:
     made = Sample.from_arrays(
         "000007",
-        io.to_float(picture(6, 8)),
+        io.to_float(noise_image(6, 8)),
         K,
         depth=np.arange(48.0).reshape(1, 6, 8),
         train_ids=np.arange(48).reshape(1, 6, 8) % 19,
@@ -50,7 +50,7 @@ def test_arrays_are_copied() -> None:
 def test_arrays_come_back() -> None:
     made = sample()
     assert (made.height, made.width, made.timestamp) == (6, 8, 0.7)
-    assert np.array_equal(made.read_image(), io.to_float(picture(6, 8)))
+    assert np.array_equal(made.read_image(), io.to_float(noise_image(6, 8)))
     assert made.read_depth().shape == (1, 6, 8) and made.read_depth()[0, 0, 1] == 1
     assert made.read_labels()[0, 0].tolist() == list(range(8)) and made.read_labels().dtype == np.uint8
     assert made.read_mask()[0, 0].tolist() == [True] * 5 + [False] * 3
@@ -64,7 +64,7 @@ def test_depth_that_is_unknown_becomes_zero() -> None:
 
 
 def test_resizing_scales_the_camera_and_all_that_is_read() -> None:
-    right = RightCamera(ImageArray(io.to_float(picture(6, 8, 1))), K, translation((-0.5, 0, 0)))
+    right = RightCamera(ImageArray(io.to_float(noise_image(6, 8, 1))), K, translation((-0.5, 0, 0)))
     half = sample(right=right).resized(3, 16)
     np.testing.assert_allclose(half.K, [[140, 0, 8.5], [0, 36, 1.75], [0, 0, 1]])
     assert half.right is not None
@@ -87,12 +87,12 @@ def test_a_resized_cloud_is_where_it_was() -> None:
 
 
 def test_files_are_read_when_asked(tmp_path: Path) -> None:
-    io.write_pixels(tmp_path / "a.png", picture(6, 8))
-    io.write_pixels(tmp_path / "wrong.png", picture(7, 8))
+    io.write_pixels(tmp_path / "a.png", noise_image(6, 8))
+    io.write_pixels(tmp_path / "wrong.png", noise_image(7, 8))
     io.write_depth(tmp_path / "half.npy", np.full((3, 4), 2.0))
     io.write_pixels(tmp_path / "tall.png", np.zeros((6, 4), np.uint8))
     made = sample(image=ImageFile(tmp_path / "a.png", 6, 8), depth=DepthFile(tmp_path / "half.npy"))
-    assert np.array_equal(made.read_image(), io.to_float(picture(6, 8)))
+    assert np.array_equal(made.read_image(), io.to_float(noise_image(6, 8)))
     assert made.read_depth().tolist() == [[[2.0] * 8] * 6]
     with pytest.raises(ValueError, match=r"wrong\.png: must be 6 x 8 as its clip is, got 7 x 8"):
         sample(image=ImageFile(tmp_path / "wrong.png", 6, 8)).read_image()

@@ -126,16 +126,16 @@ def test_sheet_has_a_row_a_step_and_a_black_error_where_all_is_right() -> None:
     clip = make_clip().resized(64, 600)
     views = parse_views(["source"], clip)
     (comparison,) = compare(make_forecast(views, [clip[2].read_image(), clip[2].read_image()]), clip, 1, views)
-    picture = comparison_sheet(comparison)
+    made_sheet = comparison_sheet(comparison)
     width, height, line, gap = 500, round(64 * 500 / 600), 24, 6
-    assert picture.shape == (2 * (line + height) + gap + line + gap, 5 * width + 4 * gap, 3)
+    assert made_sheet.shape == (2 * (line + height) + gap + line + gap, 5 * width + 4 * gap, 3)
     left = 2 * (width + gap)
-    right_one = picture[line : line + height, left : left + width]
-    wrong_one = picture[2 * line + height + gap : 2 * (line + height) + gap, left : left + width]
+    right_one = made_sheet[line : line + height, left : left + width]
+    wrong_one = made_sheet[2 * line + height + gap : 2 * (line + height) + gap, left : left + width]
     assert right_one.max() < 16  # inferno's darkest colour
     assert wrong_one.mean() > 64
     titled = comparison_sheet(comparison, "clip, view source")
-    assert titled.shape[0] == picture.shape[0] + line
+    assert titled.shape[0] == made_sheet.shape[0] + line
 
 
 def test_mistakes_are_reported() -> None:

@@ -27,11 +27,11 @@ def texture() -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
     angle, phase = 2 * math.pi * torch.rand(2, 3, 40, 1, 1)
     wavelength = 8 + 32 * torch.rand(3, 40, 1, 1)
 
-    def picture(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    def colours_at(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         waves = (2 * math.pi / wavelength * (x * angle.cos() + y * angle.sin()) + phase).sin()
         return (0.5 + 0.05 * waves.sum(dim=1)).clamp(0, 1)[None]
 
-    return picture
+    return colours_at
 
 
 def pixel_centres() -> Points:

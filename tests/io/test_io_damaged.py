@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-from data_files import picture
+from data_files import noise_image
 from PIL import Image
 
 from vestcl import io
@@ -32,11 +32,11 @@ READERS: dict[str, list[Read]] = {
 def contents(tmp_path: Path) -> dict[str, bytes]:
     """A small file of each kind."""
     rng = np.random.default_rng(0)
-    io.write_pixels(tmp_path / "rgb.png", picture(20, 30))
+    io.write_pixels(tmp_path / "rgb.png", noise_image(20, 30))
     io.write_pixels(tmp_path / "depth.png", rng.integers(0, 65536, (20, 30)).astype(np.uint16))
     io.write_pixels(tmp_path / "labels.png", rng.integers(0, 19, (20, 30)).astype(np.uint8))
-    io.write_pixels(tmp_path / "rgb.jpg", picture(20, 30))
-    Image.fromarray(picture(20, 30)).save(tmp_path / "progressive.jpg", progressive=True)
+    io.write_pixels(tmp_path / "rgb.jpg", noise_image(20, 30))
+    Image.fromarray(noise_image(20, 30)).save(tmp_path / "progressive.jpg", progressive=True)
     io.write_exr(tmp_path / "depth.exr", {"Z": rng.random((20, 30)).astype(np.float32)})
     np.save(tmp_path / "depth.npy", rng.random((20, 30)).astype(np.float32))
     return {name: (tmp_path / name).read_bytes() for name in READERS}

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from data_files import picture, real
+from data_files import noise_image, real
 
 from vestcl import io
 
@@ -92,9 +92,9 @@ def test_a_signalling_nan_is_unknown_and_no_warning(tmp_path: Path) -> None:
 
 
 def test_refuses(tmp_path: Path) -> None:
-    io.write_pixels(tmp_path / "8.png", picture()[:, :, 0])
-    io.write_pixels(tmp_path / "16.png", picture()[:, :, 0].astype(np.uint16))
-    io.write_pixels(tmp_path / "rgb.png", picture().astype(np.uint16))
+    io.write_pixels(tmp_path / "8.png", noise_image()[:, :, 0])
+    io.write_pixels(tmp_path / "16.png", noise_image()[:, :, 0].astype(np.uint16))
+    io.write_pixels(tmp_path / "rgb.png", noise_image().astype(np.uint16))
     (tmp_path / "text.npy").write_text("hello")
     np.save(tmp_path / "object.npy", np.array([None, {}]), allow_pickle=True)
     np.save(tmp_path / "deep.npy", np.zeros((2, 3, 4)))

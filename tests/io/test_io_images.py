@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from data_files import picture, write_text
+from data_files import noise_image, write_text
 from PIL import Image
 
 from vestcl import io
@@ -61,8 +61,8 @@ def test_planes_are_red_green_blue() -> None:
 
 
 def test_damaged_files_are_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    io.write_pixels(tmp_path / "a.png", picture(64, 64))
-    io.write_pixels(tmp_path / "a.jpg", picture(64, 64))
+    io.write_pixels(tmp_path / "a.png", noise_image(64, 64))
+    io.write_pixels(tmp_path / "a.jpg", noise_image(64, 64))
     for name in ("a.png", "a.jpg"):
         path = tmp_path / name
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -94,7 +94,7 @@ def test_a_file_that_ends_too_early_is_found_wherever_it_ends(
     tmp_path: Path, kind: str, options: dict[str, object], capfd: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "a"
-    content = encoded(Image.fromarray(picture(40, 50)), kind, **options)
+    content = encoded(Image.fromarray(noise_image(40, 50)), kind, **options)
     for end in range(0, len(content), 29):
         path.write_bytes(content[:end])
         with pytest.raises(ValueError, match=r"a: is not an image, or a damaged one$"):
@@ -106,7 +106,7 @@ def test_a_file_that_ends_too_early_is_found_wherever_it_ends(
 
 def test_a_byte_that_changed_in_a_png_is_found(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
-    content = bytearray(encoded(Image.fromarray(picture(40, 50)[:, :, 0]), "PNG"))
+    content = bytearray(encoded(Image.fromarray(noise_image(40, 50)[:, :, 0]), "PNG"))
     for position in range(0, len(content), 29):
         content[position] ^= 4
         path.write_bytes(content)
@@ -118,15 +118,15 @@ def test_a_byte_that_changed_in_a_png_is_found(tmp_path: Path) -> None:
 
 def test_refuses(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"must end in \.png, \.jpg or \.jpeg"):
-        io.write_pixels(tmp_path / "a.bmp", picture())
+        io.write_pixels(tmp_path / "a.bmp", noise_image())
     with pytest.raises(ValueError, match=r"`pixels` must be uint8 for \.jpg, got uint16"):
-        io.write_pixels(tmp_path / "a.jpg", picture().astype(np.uint16))
+        io.write_pixels(tmp_path / "a.jpg", noise_image().astype(np.uint16))
     with pytest.raises(ValueError, match=r"`pixels` must be \[H, W, 3\] or \[H, W\] and not empty, got \[6, 8, 2\]"):
-        io.write_pixels(tmp_path / "a.png", picture()[:, :, :2])
+        io.write_pixels(tmp_path / "a.png", noise_image()[:, :, :2])
     with pytest.raises(ValueError, match="not empty"):
-        io.write_pixels(tmp_path / "a.png", picture()[:0])
+        io.write_pixels(tmp_path / "a.png", noise_image()[:0])
     with pytest.raises(ValueError, match="`quality`"):
-        io.write_pixels(tmp_path / "a.jpg", picture(), quality=0)
+        io.write_pixels(tmp_path / "a.jpg", noise_image(), quality=0)
     with pytest.raises(ValueError, match=r"`image` must be floating, \[3, H, W\] or \[1, H, W\], got float64 \[2, 4\]"):
         io.to_pixels(np.zeros((2, 4)))
     with pytest.raises(ValueError, match="must not have NaN"):
@@ -157,4 +157,4 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
 
 def test_a_folder_that_can_not_be_made(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="its folder can't be made"):
-        io.write_pixels(write_text(tmp_path / "file") / "a.png", picture())
+        io.write_pixels(write_text(tmp_path / "file") / "a.png", noise_image())

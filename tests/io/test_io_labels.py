@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_files import picture, real
+from data_files import noise_image, real
 from PIL import Image
 
 from vestcl import io
@@ -55,7 +55,7 @@ def test_virtual_kitti(tmp_path: Path) -> None:
 
 
 def test_refuses(tmp_path: Path) -> None:
-    io.write_pixels(tmp_path / "rgb.png", picture())
+    io.write_pixels(tmp_path / "rgb.png", noise_image())
     io.write_pixels(tmp_path / "16.png", np.zeros((2, 2), np.uint16))
     io.write_pixels(tmp_path / "19.png", np.full((2, 2), 19, np.uint8))
     io.write_pixels(tmp_path / "34.png", np.full((2, 2), 34, np.uint8))

@@ -15,7 +15,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from data_files import picture, real, write_text
+from data_files import noise_image, real, write_text
 from PIL import Image
 from video_files import REORDERED, cut, flat, index_of, write_video
 
@@ -56,7 +56,7 @@ def test_any_order(clip: Path) -> None:
 @pytest.mark.parametrize(("suffix", "codec"), [("mp4", "libx264"), ("mkv", "libx264"), ("avi", "mpeg4")])
 def test_frames_that_are_reordered_are_the_same_in_any_order(tmp_path: Path, suffix: str, codec: str) -> None:
     """Open groups of images: those before a key frame in time refer to the group before. AVI has no such times."""
-    noise = [picture(32, 48, i // 3) // 2 + frame // 2 for i, frame in enumerate(flat(40))]
+    noise = [noise_image(32, 48, i // 3) // 2 + frame // 2 for i, frame in enumerate(flat(40))]
     options = REORDERED if codec == "libx264" else {"bf": "2"}
     opened = io.Video(write_video(tmp_path / f"a.{suffix}", noise, codec=codec, gop=7, options=options))
     expected = list(opened)
@@ -141,7 +141,7 @@ def test_what_comes_before_the_first_key_frame_is_not_counted(tmp_path: Path, su
 
 @pytest.mark.parametrize("suffix", ["mkv", "mp4"])
 def test_a_file_that_ends_early(tmp_path: Path, suffix: str) -> None:
-    noise = [picture(64, 96, i) for i in range(30)]
+    noise = [noise_image(64, 96, i) for i in range(30)]
     whole = write_video(tmp_path / f"a.{suffix}", noise, options=REORDERED, gop=6)
     if suffix == "mp4":
         io.write_mp4(whole, noise, 10)  # its index comes first
@@ -227,7 +227,7 @@ def test_refuses_to_write(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=r"`frames` must be \[H, W, 3\] uint8, got float64"):
             write(tmp_path / name, [np.zeros((4, 4, 3))], 10)
         with pytest.raises(ValueError, match=r"`frames` must all be \[32, 48, 3\] uint8, got uint8 \[8, 8, 3\]"):
-            write(tmp_path / name, [*flat(2), picture(8, 8)], 10)
+            write(tmp_path / name, [*flat(2), noise_image(8, 8)], 10)
         with pytest.raises(ValueError, match="must end in"):
             write(tmp_path / "a.mkv", flat(1), 10)
     assert not list(tmp_path.iterdir())
@@ -283,7 +283,7 @@ def test_a_full_disk(tmp_path: Path, size: int) -> None:
     path = tmp_path / "a.mp4"
     path.write_bytes(b"before")
     with at_most(size), pytest.raises(OSError, match=r"can't be written: File too large.*a\.mp4"):
-        io.write_mp4(path, [picture(64, 96, i) for i in range(30)], 10)
+        io.write_mp4(path, [noise_image(64, 96, i) for i in range(30)], 10)
     assert path.read_bytes() == b"before" and list(tmp_path.iterdir()) == [path]
 
 

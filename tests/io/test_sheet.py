@@ -56,15 +56,15 @@ def test_scale_bar_runs_from_low_to_high() -> None:
 
 def test_cells_lie_in_rows_and_columns() -> None:
     red, green, blue = plain(20, 30, 255, 0, 0), plain(20, 40, 0, 255, 0), plain(10, 30, 0, 0, 255)
-    picture = sheet.sheet([[Cell(red, "red"), Cell(green)], [Cell(blue), None]])
+    made = sheet.sheet([[Cell(red, "red"), Cell(green)], [Cell(blue), None]])
     line, gap = 24, 6
-    assert picture.shape == (2 * line + 20 + gap + 10, 30 + gap + 40, 3)
-    assert np.array_equal(picture[line : line + 20, :30], red)
-    assert np.array_equal(picture[line : line + 20, 36:], green)
-    assert np.array_equal(picture[2 * line + 26 :, :30], blue)
-    assert (picture[line + 20 :, 36:] == sheet.PAPER).all()
-    assert (picture[:line, :30] < 128).any()  # a label
-    assert (picture[:line, 36:] == sheet.PAPER).all()  # none
+    assert made.shape == (2 * line + 20 + gap + 10, 30 + gap + 40, 3)
+    assert np.array_equal(made[line : line + 20, :30], red)
+    assert np.array_equal(made[line : line + 20, 36:], green)
+    assert np.array_equal(made[2 * line + 26 :, :30], blue)
+    assert (made[line + 20 :, 36:] == sheet.PAPER).all()
+    assert (made[:line, :30] < 128).any()  # a label
+    assert (made[:line, 36:] == sheet.PAPER).all()  # none
 
 
 def test_title_and_bar_take_a_line_each() -> None:

@@ -22,17 +22,17 @@ def in_child(name, work):
         signal.alarm(20)  # ends a child that hangs
         try:
             work()
-            told = "passed"
+            outcome = "passed"
         except Exception as error:
-            told = f"{type(error).__name__}: {error}"
-        os.write(writing, told.encode())
+            outcome = f"{type(error).__name__}: {error}"
+        os.write(writing, outcome.encode())
         if name != "exit":
             os._exit(7)
         sys.exit(7)  # through all destructors, which takes half a second where torch is loaded
     os.close(writing)
-    told = os.read(reading, 4096).decode()
+    outcome = os.read(reading, 4096).decode()
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    print(name, "|", told or "hangs", "|", status, flush=True)
+    print(name, "|", outcome or "hangs", "|", status, flush=True)
 """
 
 DEVICES_ONLY = """

@@ -88,9 +88,9 @@ def test_table_figures_and_plot(
     assert len({*figures}) == len(figures) == 2 + len(names)
     list(_results.drawn("roofline", mapped_session, tmp_path / "deep", [section]))
     (path,) = (tmp_path / "deep").iterdir()
-    picture = imread(path)
-    assert picture.shape[0] > 400 < picture.shape[1]
-    assert len(np.unique(picture[..., :3].reshape(-1, 3), axis=0)) > 10
+    plot = imread(path)
+    assert plot.shape[0] > 400 < plot.shape[1]
+    assert len(np.unique(plot[..., :3].reshape(-1, 3), axis=0)) > 10
 
 
 @pytest.mark.parametrize("wrong", [{"calls": 0}, {"copy_bytes": 0}])

@@ -143,8 +143,8 @@ def test_errors(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_one_clips_failure_stops_no_other(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = max((folder / "image").iterdir())
-    picture.write_bytes(picture.read_bytes()[:500])
+    last_image = max((folder / "image").iterdir())
+    last_image.write_bytes(last_image.read_bytes()[:500])
     lonely = tmp_path / "lonely"
     write_pixels(lonely / "image" / "0.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     write_text(lonely / "camera.json", (folder / "camera.json").read_text())

@@ -32,7 +32,7 @@ def test_a_shift_is_found(shift: tuple[int, int]) -> None:
 
 def test_half_a_pixel() -> None:
     """Five pixels of images of twice the size."""
-    src, dst = (picture.reshape(3, HEIGHT // 2, 2, WIDTH // 2, 2).mean((2, 4)) for picture in shifted(5, 0))
+    src, dst = (large.reshape(3, HEIGHT // 2, 2, WIDTH // 2, 2).mean((2, 4)) for large in shifted(5, 0))
     flow_uv = correspond(src, dst).flow_uv[:, 8:-8, 8:-8]
     np.testing.assert_allclose(np.median(flow_uv, axis=(1, 2)), [2.5, 0], atol=SUBPIXEL)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from tiny_networks import IMAGENET, picture, pixels, processor
+from tiny_networks import IMAGENET, noise_image, pixels, processor
 
 from vestcl.scene.estimators._preparation import Preparation
 
@@ -30,7 +30,7 @@ def test_images_are_prepared_as_transformers_does(tmp_path: Path, name: str, siz
     theirs = processor(name)(**settings)
     theirs.save_pretrained(tmp_path)
     config = json.loads((tmp_path / "preprocessor_config.json").read_text())
-    image = picture(*size)
+    image = noise_image(*size)
     wanted = theirs(pixels(image), return_tensors="pt", input_data_format="channels_first")["pixel_values"]
     ours = Preparation.read(name, config, zoe=name.startswith("Zoe"), size=None)(torch.from_numpy(image)[None])
     torch.testing.assert_close(ours, wanted, rtol=0, atol=tolerance)

@@ -18,7 +18,7 @@ from tiny_networks import (
     STREET,
     depth_anything,
     mask2former,
-    picture,
+    noise_image,
     processor,
     segformer,
     transformers,
@@ -52,17 +52,17 @@ CLASS = ("segformer", "mask2former")
 @pytest.mark.parametrize("size", [(48, 120), (37, 41), (5, 90)])
 def test_depth_is_metres_at_the_images_size(checkpoints: Path, name: str, size: tuple[int, int]) -> None:
     estimator = DepthEstimator.load(checkpoints / name)
-    depth = estimator(picture(*size))
+    depth = estimator(noise_image(*size))
     assert depth.shape == (1, *size) and depth.dtype == np.float32
     assert np.isfinite(depth).all() and depth.min() >= NEAREST
-    assert np.array_equal(depth, estimator(picture(*size)))
-    assert not np.allclose(depth, estimator(picture(*size, seed=1)), rtol=1e-3)
+    assert np.array_equal(depth, estimator(noise_image(*size)))
+    assert not np.allclose(depth, estimator(noise_image(*size, seed=1)), rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", DEPTH)
 def test_a_batch_gives_what_each_image_gives(checkpoints: Path, name: str) -> None:
     estimator = DepthEstimator.load(checkpoints / name)
-    images = np.stack([picture(seed=seed) for seed in range(3)])
+    images = np.stack([noise_image(seed=seed) for seed in range(3)])
     single = np.stack([estimator(image) for image in images])
     np.testing.assert_allclose(estimator.batch(images), single, rtol=1e-4)
 
@@ -70,18 +70,18 @@ def test_a_batch_gives_what_each_image_gives(checkpoints: Path, name: str) -> No
 def test_zoedepth_measures_streets_whatever_its_classifier_votes(checkpoints: Path) -> None:
     """Both have the same weights but for the vote; the room's head would answer something else."""
     room, street = (DepthEstimator.load(checkpoints / f"votes-{name}") for name in ("nyu", "kitti"))
-    forced = room(picture())
-    assert np.array_equal(forced, street(picture()))
+    forced = room(noise_image())
+    assert np.array_equal(forced, street(noise_image()))
     own = transformers().ZoeDepthForDepthEstimation.from_pretrained(checkpoints / "votes-nyu").eval()
     room.model.metric_head.mlp_classifier = own.metric_head.mlp_classifier
     unforced = DepthEstimator(room.model, room.preparation, None, room.flip, "cpu")
-    assert not np.allclose(forced, unforced(picture()), rtol=0.01)
+    assert not np.allclose(forced, unforced(noise_image()), rtol=0.01)
     with pytest.raises(RuntimeError, match="was not counted"):
-        room(picture())
+        room(noise_image())
 
 
 def test_zoedepth_averages_with_the_mirrored_image(checkpoints: Path) -> None:
-    image = picture()
+    image = noise_image()
     both = DepthEstimator.load(checkpoints / "one-head")
     np.testing.assert_allclose(both(image[..., ::-1]), both(image)[..., ::-1], rtol=1e-4)
     one = DepthEstimator.load(checkpoints / "one-head", flip=False)
@@ -94,7 +94,7 @@ def test_depth_lies_where_the_image_has_it(zoe: bool) -> None:
     settings = {"size": {"height": 64, "width": 64}, "keep_aspect_ratio": True, "resample": 2, **HALVES}
     preparation = Preparation.read("", {**settings, "ensure_multiple_of": 32}, zoe=zoe, size=None)
     model = lambda pixel_values: SimpleNamespace(predicted_depth=pixel_values[:, 0] * 20 + 40)  # noqa: E731
-    image = picture(60, 200)
+    image = noise_image(60, 200)
     depth = DepthEstimator(model, preparation, None, zoe, "cpu")(image)
     inside = np.s_[:, 3:-3, 3:-3]
     wanted = (20 + 40 * image[:1])[inside]
@@ -103,7 +103,7 @@ def test_depth_lies_where_the_image_has_it(zoe: bool) -> None:
 
 
 def test_depth_anything_agrees_with_transformers(checkpoints: Path) -> None:
-    folder, image = checkpoints / "depth-anything", picture()
+    folder, image = checkpoints / "depth-anything", noise_image()
     estimator = DepthEstimator.load(folder)
     model = transformers().DepthAnythingForDepthEstimation.from_pretrained(folder).eval()
     theirs = processor("DPTImageProcessor").from_pretrained(folder)
@@ -115,7 +115,7 @@ def test_depth_anything_agrees_with_transformers(checkpoints: Path) -> None:
 
 @pytest.mark.parametrize(("name", "kind"), [("segformer", "Segformer"), ("mask2former", "Mask2Former")])
 def test_classes_agree_with_transformers(checkpoints: Path, name: str, kind: str) -> None:
-    folder, image = checkpoints / name, picture()
+    folder, image = checkpoints / name, noise_image()
     estimator = SegmentationEstimator.load(folder)
     networks = {"segformer": "SegformerForSemanticSegmentation", "mask2former": "Mask2FormerForUniversalSegmentation"}
     model = getattr(transformers(), networks[name]).from_pretrained(folder).eval()
@@ -130,7 +130,7 @@ def test_classes_agree_with_transformers(checkpoints: Path, name: str, kind: str
 @pytest.mark.parametrize("name", CLASS)
 def test_classes_are_train_ids_at_the_images_size(checkpoints: Path, name: str) -> None:
     estimator = SegmentationEstimator.load(checkpoints / name)
-    images = np.stack([picture(37, 41, seed) for seed in range(2)])
+    images = np.stack([noise_image(37, 41, seed) for seed in range(2)])
     ids = estimator.batch(images)
     assert ids.shape == (2, 1, 37, 41) and ids.dtype == np.uint8 and ids.max() < len(CLASSES)
     assert np.array_equal(ids[0], estimator(images[0])) and np.array_equal(ids[1], estimator(images[1]))
@@ -142,7 +142,7 @@ def test_a_size_from_the_user(checkpoints: Path) -> None:
         96,
         288,
     )
-    assert SegmentationEstimator.load(checkpoints / "segformer", size=(64, 200))(picture()).shape == (1, 48, 120)
+    assert SegmentationEstimator.load(checkpoints / "segformer", size=(64, 200))(noise_image()).shape == (1, 48, 120)
     with pytest.raises(ValueError, match=r"`size` must be \(height, width\) in px, got \(0, 3\)"):
         SegmentationEstimator.load(checkpoints / "segformer", size=(0, 3))
 
@@ -249,7 +249,7 @@ def test_damaged_weights_do_not_pass_as_an_answer(checkpoints: Path, weights: st
     for parameter in estimator.model.parameters():
         parameter.fill_(float("nan"))
     with pytest.raises(ValueError, match="must give finite"):
-        estimator(picture())
+        estimator(noise_image())
 
 
 @pytest.mark.parametrize(

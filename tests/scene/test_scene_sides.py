@@ -31,8 +31,8 @@ def test_what_runs_along_the_road_continues() -> None:
 
 def test_it_is_mirrored_in_depth() -> None:
     """Colour = r, so that it shows where it is from: 1/r' = 2/r_0 - 1/r, on the row of the vanishing point."""
-    picture = (R / 400).astype(np.float32)[None]
-    carried = carry_on(picture, NEXT_TO, NEXT_TO, CENTRE)[0, 40, 290] * 400
+    radial = (R / 400).astype(np.float32)[None]
+    carried = carry_on(radial, NEXT_TO, NEXT_TO, CENTRE)[0, 40, 290] * 400
     edge, r = 120.0, 290.5 - 150.0
     weight = np.exp(-(r / edge - 1) / 0.5)
     wanted = weight / (2 / edge - 1 / r) + (1 - weight) * r
@@ -40,10 +40,10 @@ def test_it_is_mirrored_in_depth() -> None:
 
 
 def test_far_in_the_hole_the_smooth_fill_is_left() -> None:
-    picture = (R / 400).astype(np.float32)[None]
+    radial = (R / 400).astype(np.float32)[None]
     hole = X > 160
-    carried = carry_on(picture, hole, hole, CENTRE)
-    np.testing.assert_allclose(carried[0, 35:45, 300:], picture[0, 35:45, 300:], atol=0.01)
+    carried = carry_on(radial, hole, hole, CENTRE)
+    np.testing.assert_allclose(carried[0, 35:45, 300:], radial[0, 35:45, 300:], atol=0.01)
 
 
 def test_holes_inside_and_known_pixels_stay() -> None:

@@ -42,10 +42,8 @@ def bare() -> Clip:
     texture = rng.random((3, HEIGHT, WIDTH + 2 * FRAMES), np.float32)
     K = np.array([[60, 0, WIDTH / 2], [0, 60, HEIGHT / 2], [0, 0, 1.0]])
     depth = np.full((1, HEIGHT, WIDTH), 9.0)
-    pictures = (texture[:, :, 2 * i : 2 * i + WIDTH] for i in range(FRAMES))
-    return Clip(
-        "texture", "arrays", tuple(Sample.from_arrays(str(i), p, K, depth=depth) for i, p in enumerate(pictures))
-    )
+    images = (texture[:, :, 2 * i : 2 * i + WIDTH] for i in range(FRAMES))
+    return Clip("texture", "arrays", tuple(Sample.from_arrays(str(i), p, K, depth=depth) for i, p in enumerate(images)))
 
 
 # ---------------------------------------------------------------- damages of any file

@@ -20,7 +20,7 @@ def real(name: str) -> Path:
     return path
 
 
-def picture(height: int = 6, width: int = 8, seed: int = 0) -> np.ndarray:
+def noise_image(height: int = 6, width: int = 8, seed: int = 0) -> np.ndarray:
     """[H, W, 3] uint8 noise."""
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), np.uint8)
 
@@ -28,7 +28,7 @@ def picture(height: int = 6, width: int = 8, seed: int = 0) -> np.ndarray:
 def write_images(folder: Path, names: Iterable[str], height: int = 6, width: int = 8) -> None:
     """Noise, another in every file: the image of the i-th name has seed i."""
     for seed, name in enumerate(names):
-        write_pixels(folder / name, picture(height, width, seed))
+        write_pixels(folder / name, noise_image(height, width, seed))
 
 
 def write_text(path: Path, *lines: str) -> Path:

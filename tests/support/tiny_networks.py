@@ -21,7 +21,7 @@ HALVES = {"image_mean": [0.5, 0.5, 0.5], "image_std": [0.5, 0.5, 0.5]}
 QUERY_GAIN = 4.0
 
 
-def picture(height: int = 48, width: int = 120, seed: int = 0) -> NDArray[np.float32]:
+def noise_image(height: int = 48, width: int = 120, seed: int = 0) -> NDArray[np.float32]:
     """Smooth colours, in steps of 1/255 as any file's."""
     coarse = np.random.default_rng(seed).random((1, 3, 5, 9), np.float32)
     smooth = torch.nn.functional.interpolate(torch.from_numpy(coarse), (height, width), mode="bicubic").clamp(0, 1)

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import yaml
 from forecaster_scenes import TINY
+from train.card.drawn import draw_curves, smoothed, stages_of, write_sheet
 
 from train.card import __main__ as card
-from train.card import pictures as card_images
+from train.card import drawn as card_images
 from train.card import tables as card_tables
 from train.card.__main__ import Card, main, portable, thinned, write_card
-from train.card.pictures import draw_curves, smoothed, stages_of, write_sheet
 from train.evaluation.protocols import PROTOCOLS
 from train.evaluation.report import EvaluationResults, as_json
 from train.evaluation.windows import CAMERA, CONSTANT_VELOCITY
@@ -275,8 +275,8 @@ def test_curves_are_drawn_of_what_there_is(tmp_path: Path) -> None:
     rows[5] = {**rows[5], "l1": None, "loss": 5.0}
     draw_curves(tmp_path / "b.png", rows)
     draw_curves(tmp_path / "c.png", rows[:1])
-    pictures = [read_pixels(tmp_path / f"{name}.png") for name in "abc"]
-    assert len({picture.shape for picture in pictures}) == 1 and (pictures[0] != pictures[1]).any()
+    drawn = [read_pixels(tmp_path / f"{name}.png") for name in "abc"]
+    assert len({image.shape for image in drawn}) == 1 and (drawn[0] != drawn[1]).any()
 
 
 def test_a_sheet_gets_smaller_until_it_fits(tmp_path: Path) -> None:

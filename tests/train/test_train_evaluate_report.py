@@ -67,8 +67,8 @@ def test_the_present_has_a_column_of_its_own() -> None:
 
 def test_running_means_are_up_to_the_horizon() -> None:
     protocol = dataclasses.replace(PROTOCOLS["kitti-space"], now=False)
-    pictures = [record(GEOMETRIC, "a", [10.0, 20.0, 60.0], metric="psnr")]
-    made = grids(EvaluationResults(protocol, pictures, (1, 3), ()))
+    images = [record(GEOMETRIC, "a", [10.0, 20.0, 60.0], metric="psnr")]
+    made = grids(EvaluationResults(protocol, images, (1, 3), ()))
     running = find(made, "view source, mean over 1 window, and over t+1 to the horizon")
     assert running.heading == ("", "PSNR t+3", "s") and running.rows == ((GEOMETRIC, "30.00", "0.50"),)
 

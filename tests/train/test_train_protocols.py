@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
-from data_files import picture
+from data_files import noise_image
 from kitti_trees import calibration
 
 from train.evaluation.protocols import HELD_OUT, NOW, PROTOCOLS, Name, Where, currents
@@ -28,7 +28,7 @@ def empty_drives(root: Path, frames: Mapping[str, int]) -> Path:
     for number, count in frames.items():
         for camera in ("02", "03"):
             folder = root / "2011_09_26" / f"2011_09_26_drive_{number}_sync" / f"image_{camera}" / "data"
-            write_pixels(folder / f"{0:010}.png", picture(10, 33))
+            write_pixels(folder / f"{0:010}.png", noise_image(10, 33))
             for index in range(1, count):
                 (folder / f"{index:010}.png").touch()
     return root
@@ -102,7 +102,7 @@ def test_clips_without_a_window_are_reported(tmp_path: Path) -> None:
 
 def test_snippets_of_cityscapes_val(tmp_path: Path) -> None:
     camera = {"intrinsic": {"fx": 2262.5, "fy": 2265.3, "u0": 1096.9, "v0": 513.1}, "extrinsic": {"baseline": 0.2093}}
-    write_pixels(tmp_path / "tiny.png", picture(4, 8))
+    write_pixels(tmp_path / "tiny.png", noise_image(4, 8))
     tiny, reported = (tmp_path / "tiny.png").read_bytes(), json.dumps(camera)
     for city in CITIES:
         folders = [tmp_path / kind / "val" / city for kind in ("leftImg8bit_sequence", "camera")]

@@ -175,10 +175,10 @@ def test_a_training_sheet_shows_all_four(tmp_path: Path) -> None:
     batch, colours = batch_of(), {"t": 0.2, "truth": 0.8, "forecast": 0.5}
     batch.frame_cur.image.fill_(colours["t"])
     batch.target.fill_(colours["truth"])
-    picture = training_sheet(batch, view_of(torch.full((2, 3, HEIGHT, WIDTH), colours["forecast"])), "step 1")
-    assert picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3
-    middle = picture.shape[1] // 2
-    halves = picture[:, :middle], picture[:, middle:]
+    contact_sheet = training_sheet(batch, view_of(torch.full((2, 3, HEIGHT, WIDTH), colours["forecast"])), "step 1")
+    assert contact_sheet.dtype == np.uint8 and contact_sheet.ndim == 3 and contact_sheet.shape[2] == 3
+    middle = contact_sheet.shape[1] // 2
+    halves = contact_sheet[:, :middle], contact_sheet[:, middle:]
     for half, names in ((halves[0], ("t", "forecast")), (halves[1], ("truth",))):
         for name in names:
             level = round(255 * colours[name])

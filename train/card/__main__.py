@@ -19,8 +19,8 @@ import tyro
 import yaml
 from huggingface_hub import ModelCard, ModelCardData
 
-from train.card import pictures as card_images
-from train.card.pictures import Rows
+from train.card import images as card_images
+from train.card.images import Rows
 from train.card.tables import Weights, about_model, data_table, prepare_commands, result_tables, training_table
 from train.command import ERRORS, failed, warnings_in_lines
 from train.evaluation.options import Evaluation

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from train.card.pictures import PARTS, Rows, stages_of
+from train.card.images import PARTS, Rows, stages_of
 from train.evaluation.inputs import label_of, plain
 from train.fit import window_set
 from train.settings.config import Config, DataConfig, LossConfig

@@ -90,9 +90,9 @@ def headline(records: Sequence[Record]) -> list[str]:
 def grids(results: EvaluationResults) -> list[Grid]:
     """All tables: by horizon, differences, the paper's, running means, intervals, by clip."""
     name, records, horizons = results.protocol.title, results.records, results.horizons
-    pictures = [record for record in records if record.first == 1 and "psnr" in record.scores]
+    of_images = [record for record in records if record.first == 1 and "psnr" in record.scores]
     further = [
-        *picture_grids(name, pictures, [k for k in horizons if k > 1], running=True),
+        *picture_grids(name, of_images, [k for k in horizons if k > 1], running=True),
         *(_interval_grid(view, of_view, results) for view, of_view in by_view(records).items()),
         *_clip_grids(results),
     ]

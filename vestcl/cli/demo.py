@@ -159,7 +159,7 @@ def _scores(
 
 
 def _score(image: Image, truth: Image) -> dict[str, float]:
-    pair = (metrics.quantise(torch.from_numpy(np.ascontiguousarray(picture))[None]) for picture in (image, truth))
+    pair = (metrics.quantise(torch.from_numpy(np.ascontiguousarray(predicted))[None]) for predicted in (image, truth))
     first, second = pair
     return {"psnr": float(metrics.psnr(first, second)), "ssim": float(metrics.ssim(first, second))}
 

@@ -157,9 +157,9 @@ def write_forecast(
         about["views"][view.name] = _about_view(forecast, clip, index, view) | files
         if report is not None:
             report(done / len(views))
-    for name, picture in details.sheets.items():
+    for name, sheet in details.sheets.items():
         about["views"][name]["sheet"] = f"{name}/sheet.png"
-        write_pixels(out / name / "sheet.png", picture)
+        write_pixels(out / name / "sheet.png", sheet)
     about["seconds"] = dict(forecast.seconds) | {WRITING: time.perf_counter() - start}
     write_bytes(out / JSON, _encoded(about))
     return out / JSON

@@ -176,10 +176,10 @@ def write_gif(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float)
         raise ValueError(f"{path}: must end in .gif")
     _, checked = _checked(frames, fps)
     duration = max(_GIF_STEP_MS * round(1000 / fps / _GIF_STEP_MS), _GIF_SHORTEST_MS)
-    pictures = (Image.fromarray(frame).quantize(256) for frame in checked)
-    first = next(pictures)
+    images = (Image.fromarray(frame).quantize(256) for frame in checked)
+    first = next(images)
     with replacing(path) as temporary:
-        first.save(temporary, save_all=True, append_images=pictures, duration=duration, loop=0)
+        first.save(temporary, save_all=True, append_images=images, duration=duration, loop=0)
 
 
 def _checked(frames: Iterable[NDArray[np.uint8]], fps: float) -> tuple[NDArray[np.uint8], Iterator[NDArray[np.uint8]]]:

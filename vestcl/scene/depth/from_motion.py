@@ -84,29 +84,29 @@ def motion_depth(
 
     Source: SPEC section 8; Nister, An Efficient Solution to the Five-Point Relative Pose Problem, 2004.
     """
-    pictures = _images(images)
+    frames = _images(images)
     K = checked.matrix("K", K, 3)
     if not camera_height > 0:
         raise ValueError(f"`camera_height` must be above 0 m, got {camera_height}")
-    flow = correspond(pictures[-1], pictures[-2]) if correspondence is None else correspondence
-    motion, measured = observe(pictures, K, flow)
-    rays = rays_of(K, *pictures[-1].shape[1:])
+    flow = correspond(frames[-1], frames[-2]) if correspondence is None else correspondence
+    motion, measured = observe(frames, K, flow)
+    rays = rays_of(K, *frames[-1].shape[1:])
     if measured is None:
-        turned, _ = epipolar(K, motion, *pictures[-1].shape[1:])
+        turned, _ = epipolar(K, motion, *frames[-1].shape[1:])
         found = moving_by_turn(flow, motion, K)
-        moving = whole_objects(found, pictures[-1], pictures[-2], flow, turned[:2] / np.maximum(turned[2], 1e-3))
+        moving = whole_objects(found, frames[-1], frames[-2], flow, turned[:2] / np.maximum(turned[2], 1e-3))
         nothing = Measured(rays[0] * 0, np.full_like(rays[0], np.inf), moving, [0.0])
-        return _complete(nothing, _ground(None, rays, camera_height), pictures[-1], motion)
+        return _complete(nothing, _ground(None, rays, camera_height), frames[-1], motion)
     plane = fit_road(measured.inverse, measured.std, K)
     metres = _metres(measured, plane, camera_height)
     motion[:3, 3] *= metres * measured.lengths[0]
     scaled = measured._replace(inverse=measured.inverse / metres, std=measured.std / metres)
-    complete = _complete(scaled, _ground(plane, rays, camera_height), pictures[-1], motion)
+    complete = _complete(scaled, _ground(plane, rays, camera_height), frames[-1], motion)
     return complete._replace(speed_before=measured.speed_before)
 
 
 def observe(
-    pictures: Sequence[NDArray[np.float32]], K: Array, correspondence: Correspondence | None = None
+    frames: Sequence[NDArray[np.float32]], K: Array, correspondence: Correspondence | None = None
 ) -> tuple[Array, Measured | None]:
     """What flow from the last image to up to two earlier ones measures.
 
@@ -119,10 +119,10 @@ def observe(
         [4, 4] from the last camera to the one before, of unit length or without a translation; inverse depth, None
         where no view has a translation.
     """
-    flows = [correspond(pictures[-1], pictures[-2]) if correspondence is None else correspondence]
-    flows += [correspond(pictures[-1], earlier) for earlier in pictures[-3 : -2 - _VIEWS : -1]]
+    flows = [correspond(frames[-1], frames[-2]) if correspondence is None else correspondence]
+    flows += [correspond(frames[-1], earlier) for earlier in frames[-3 : -2 - _VIEWS : -1]]
     poses = [relative_pose(flow, K) for flow in flows]
-    return poses[0].dst_from_src.copy(), measure(pictures[-1], flows, poses, K)
+    return poses[0].dst_from_src.copy(), measure(frames[-1], flows, poses, K)
 
 
 def _images(images: Sequence[ArrayLike]) -> list[NDArray[np.float32]]:

@@ -115,7 +115,7 @@ def _searched(max_disparity: int | None, focal: float, width: int) -> int:
 def _match(left: NDArray[np.uint8], right: NDArray[np.uint8], searched: int) -> tuple[Disparity, NDArray[np.bool_]]:
     """Filtered disparity [H, W] px, and where left and right agree. Columns are added on the left, where matching
     has to look beyond the image."""
-    pair = [cv2.copyMakeBorder(picture, 0, 0, searched, 0, cv2.BORDER_REPLICATE) for picture in (left, right)]
+    pair = [cv2.copyMakeBorder(side, 0, 0, searched, 0, cv2.BORDER_REPLICATE) for side in (left, right)]
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=searched,

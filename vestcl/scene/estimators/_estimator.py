@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.scene.estimators._preparation import Preparation, one_image, pictures
+from vestcl.scene.estimators._preparation import Preparation, image_array, one_image
 
 Number = TypeVar("Number", np.float32, np.uint8)
 
@@ -47,7 +47,7 @@ class Estimator(Generic[Number]):
         Raises:
             ValueError: another shape, numbers outside [0, 1], or a checkpoint that answers with NaN.
         """
-        values = torch.from_numpy(pictures(images))
+        values = torch.from_numpy(image_array(images))
         seen = self.preparation(values.to(self.device))
         planes: NDArray[Number] = self._estimate(seen, *values.shape[-2:]).cpu().numpy()
         return planes

@@ -123,7 +123,7 @@ class Preparation:
         return (images.clamp(0, 1) * self.gain - mean) / std
 
 
-def pictures(images: ArrayLike) -> NDArray[np.float32]:
+def image_array(images: ArrayLike) -> NDArray[np.float32]:
     """``images`` as [B, 3, H, W] float32.
 
     Raises:
@@ -149,7 +149,7 @@ def one_image(image: ArrayLike) -> NDArray[np.float32]:
     array = np.asarray(image)
     if array.ndim != 3:
         raise ValueError(f"`image` must be [3, H, W], got {list(array.shape)}")
-    return pictures(array[None])
+    return image_array(array[None])
 
 
 def _size(name: str, config: Mapping[str, Any]) -> tuple[tuple[int, int], Fit]:

@@ -170,8 +170,8 @@ def _reduced(
     height, width = hole.shape[1:]
     scale = min(1.0, _SLOW_HEIGHT / height)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    picture = push_pull(colour, ~hole[0]).transpose(1, 2, 0)
-    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).transpose(2, 0, 1)
+    filled_image = push_pull(colour, ~hole[0]).transpose(1, 2, 0)
+    small = cv2.resize(filled_image, size, interpolation=cv2.INTER_AREA).transpose(2, 0, 1)
     gap = np.asarray(cv2.resize(hole[0].astype(np.float32), size, interpolation=cv2.INTER_AREA)) > 0
     solved = solve(np.ascontiguousarray(small, np.float32), gap).transpose(1, 2, 0)
     return np.where(
