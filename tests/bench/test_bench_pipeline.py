@@ -214,7 +214,7 @@ def test_load_takes_quality_and_precision(tmp_path: Path) -> None:
         ({"frames": 3}, "`frames` must be 4 or more, got 3"),
         ({"scenes": ()}, "`scenes` must be one or more, got none"),
         ({"seconds": 0.0}, "`seconds` must be positive"),
-        ({"model": "vest-xl"}, "vest-xl: is no model"),
+        ({"model": "vest-xl"}, "vest-xl: is not a model"),
     ],
 )
 def test_refuses(change: dict[str, Any], message: str) -> None:
