@@ -109,19 +109,19 @@ def test_children_report_how_they_ended() -> None:
 
     assert ending("print('{\"name\": 1}')") == ""
     assert ending("raise OSError('no luck')") == "OSError: no luck"
-    assert ending("raise SystemExit(3)") == "it said nothing"
+    assert ending("raise SystemExit(3)") == "it printed nothing"
     abort = "import os, sys; print('assertion failed', file=sys.stderr, flush=True); os.abort()"
     assert ending(abort) == "was killed by SIGABRT: assertion failed"
     kill = f"import os; os.kill(os.getpid(), {int(signal.SIGSEGV)})"
-    assert ending(kill) == "was killed by SIGSEGV: it said nothing"
+    assert ending(kill) == "was killed by SIGSEGV: it printed nothing"
 
 
 def test_a_crash_after_some_steps_is_put_down_to_the_next(only_pip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (info,) = (device.info for device in doctor.examine().devices)
     passed = tuple({"name": name, "passed": True, "detail": ""} for name in ("build", "run"))
-    crash = doctor._Child(passed, "was killed by SIGSEGV: it said nothing")
+    crash = doctor._Child(passed, "was killed by SIGSEGV: it printed nothing")
     monkeypatch.setattr(doctor, "_run_child", lambda *_: crash)
     device = doctor._examine_device(info, timeout=60)
     assert not device.works
     assert [(step.name, step.passed) for step in device.steps] == [("build", True), ("run", True), ("float64", False)]
-    assert "float64: was killed by SIGSEGV: it said nothing" in device.notes
+    assert "float64: was killed by SIGSEGV: it printed nothing" in device.notes

@@ -48,7 +48,7 @@ class TrainingError(RuntimeError):
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Train a model as a configuration says."""
+    """Train a model by a configuration."""
 
     config: tyro.conf.Positional[Path]
     """YAML file."""
@@ -171,7 +171,7 @@ class _Run:
         self.config, self.ranks, self.stop = config, ranks, stop
         self.model: Forecaster = build_model(config)
         self.average = Average(self.model, config.optimiser.ema) if config.optimiser.ema else None
-        #: What the weights were shown, those of ``init`` included as far as their file says.
+        #: What the weights were shown, those of ``init`` included as far as their file lists them.
         self.trained_on = (read_trained_on(config.init) if config.init else None) or {}
         self.perceptual = {loss: build_perceptual(loss) for loss in map(config.loss_of, config.stages)}
         self.step = 0

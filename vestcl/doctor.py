@@ -109,7 +109,7 @@ def _run_child(command: Sequence[str], timeout: float) -> _Child:
 
 
 def _ending(code: int, errors: str) -> str:
-    said = [line.strip() for line in errors.splitlines() if line.strip()] or ["it said nothing"]
+    said = [line.strip() for line in errors.splitlines() if line.strip()] or ["it printed nothing"]
     if code < 0:
         return f"was killed by {signal.Signals(-code).name}: {' / '.join(said[-3:])}"
     return said[-1] if code else ""

@@ -236,7 +236,7 @@ def _commands(options: Card, config: Config, weights: Weights, results: Results)
 
 
 def _evaluate_command(saved: dict[str, Any], weights: Weights) -> str:
-    """With what results.json says was set, without the defaults."""
+    """The options set in results.json, without the defaults."""
     name, (height, width) = saved["settings"]["protocol"], saved["settings"]["size"]
     plain = PROTOCOLS[name]
     defaults = {field.name: field.default for field in dataclasses.fields(Evaluation)}

@@ -81,7 +81,7 @@ def _camera(config: ModelConfig) -> str:
 
 _START: Final = {"rest": "rest", "prior": "what was measured (the prior)"}
 _BASE: Final = {
-    "none": "nothing: it paints",
+    "none": "nothing: it predicts RGB directly",
     "splatted": "the splatted colour",
     "filled": "the splatted colour, holes filled",
 }

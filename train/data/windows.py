@@ -231,7 +231,7 @@ class WindowSet:
         return TrainingWindow(prev, cur, image, K, tgt_from_next, future_from_cur, self._poses(clip, draw.frame), path)
 
     def augmented(self, window: TrainingWindow, rng: np.random.Generator) -> TrainingWindow:
-        """Cut out, shrunk, mirrored and coloured as the settings say, by numbers from ``rng``."""
+        """Cut out, shrunk, mirrored and coloured as set, by numbers from ``rng``."""
         (rows, columns), (share, down, across, side) = window.size, rng.random(4)
         scale = self.scale[0] + (self.scale[1] - self.scale[0]) * share
         if self.crop is None:

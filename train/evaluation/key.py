@@ -14,7 +14,7 @@ from vestcl.cli.prepare import identity
 from vestcl.evaluation import st_lpips
 from vestcl.prepare.files import JSON
 
-#: Settings that scores do not depend on, or that stand in the key as the content of files.
+#: Settings that scores do not depend on, or that are in the key as the content of files.
 _NOT_IN_KEY: Final = (
     "model",
     "squeeze",

@@ -13,7 +13,7 @@
 In kitti-space the right camera's image at t is the answer, so no depth may be matched against it
 (`train.evaluation.inputs`). The paper's SSIM has several scales; for that one view it follows VEST-MPI (`NOW_NOTE`).
 
-Source: SPEC section 10. Where a two-frame method stands in a window of 4 + 5 it takes frames 2 and 3, counted from 0.
+Source: SPEC section 10. Where a two-frame method is used in a window of 4 + 5 it takes frames 2 and 3, counted from 0.
 """
 
 import functools
@@ -58,7 +58,7 @@ NOW_NOTE: Final = (
 
 #: What every table of the paper's figures says.
 PAPER_NOTE: Final = (
-    "The paper's figures are of its own depth, masks, inpainting and training; they say where the field stands."
+    "The paper's figures are of its own depth, masks, inpainting and training; they show the state of the art."
 )
 
 
@@ -136,7 +136,7 @@ class Protocol:
 
 
 def currents(frames: int, steps: int, first: int | None, last: int | None = None) -> range:
-    """The current frame t of every window, stride 1: a frame stands before it and ``steps`` follow.
+    """The current frame t of every window, stride 1: a frame precedes it and ``steps`` follow.
 
     Args:
         frames: of the clip.

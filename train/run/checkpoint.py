@@ -264,7 +264,7 @@ def _read(path: Path) -> TrainingState:
 
 
 def _verified(path: Path, digest: Callable[[Path], str] = sha256) -> dict[str, Any]:
-    """The manifest's files, which are as it says, by their sizes and hashes.
+    """The manifest's files, checked by size and hash.
 
     Raises:
         OSError, ValueError, KeyError, TypeError, AttributeError: they are not.

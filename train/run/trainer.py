@@ -113,7 +113,7 @@ class Average:
 
 
 class Trainer:
-    """Updates ``model`` as ``stage`` says.
+    """Updates ``model`` by the settings of ``stage``.
 
     Args:
         config: of the run.

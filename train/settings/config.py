@@ -324,7 +324,7 @@ def from_dict(settings: Mapping[str, Any]) -> Config:
 
 
 def with_stage_parts(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """A stage's ``data`` and ``loss`` say what differs from the run's."""
+    """A stage's ``data`` and ``loss`` list what differs from the run's."""
     stages = settings.get("stages")
     if not isinstance(stages, Sequence) or not all(isinstance(stage, Mapping) for stage in stages):
         return dict(settings)

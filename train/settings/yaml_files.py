@@ -118,7 +118,7 @@ def _apply(settings: dict[str, Any], override: str) -> None:
         raise ValueError(f"an override must be key=value or key.sub=value, got {override!r}")
     place: Any = settings
     for part in parts[:-1]:
-        if isinstance(place, dict) and place.get(part) is None:  # absent, or a null that stood for nothing
+        if isinstance(place, dict) and place.get(part) is None:  # absent, or a null for nothing
             place[part] = {}
         place = place[_index(place, part, override)]
     place[_index(place, parts[-1], override)] = _parse(text, f"the value of {override!r}")

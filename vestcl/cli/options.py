@@ -72,7 +72,7 @@ RANGES: Final[Mapping[str, Range]] = {
 
 #: Options that name files to write.
 _OUTPUT_FILES: Final = ("json", "markdown", "trace")
-#: Options that name folders to write to, unless a command says that it is a file.
+#: Options that name folders to write to, unless a command declares a file.
 _OUTPUT_FOLDERS: Final = ("out", "plots")
 
 #: How the annotation of a positional argument reads: tyro's marker, as a type or as text.
@@ -83,7 +83,7 @@ _OF_A_FILE: Final = re.compile(r"[^`]*\.(json|ya?ml|txt): ")
 #: "its" are a view's own: `--view 0,0,1,fov=200` has no --fov.
 _QUOTED: Final = re.compile(r"(?<!its )`([a-z]\w*)`")
 _ASKED_FOR: Final = re.compile(r"(?<=leave out )`([a-z]\w*)`|(?<=give )`([a-z]\w*)`")
-#: What a reader says of options that it does not have.
+#: A reader's message about options that it does not have.
 _NOT_TAKEN: Final = re.compile(r"(?:(?<=, which takes )([\w, ]+), not |(?<=it does not take ))([\w, ]+)$")
 
 

@@ -144,7 +144,7 @@ def open_input(text: str, options: Prepare) -> Clip:
 
 
 def _driven(street: street_input.StreetInput, options: Prepare) -> street_input.Driven:
-    """What the input says of its street, and where it says nothing the options."""
+    """The street's settings from its input, else from the options."""
     fps = None if options.street_fps is None else street_input.rate(options.street_fps, "`street_fps`")
     given = street_input.Driven(options.drive, fps, options.street_depth, options.street_masks)
     return street.driven.over(given)

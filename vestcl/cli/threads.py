@@ -86,7 +86,7 @@ def apply(count: int | None) -> None:
 
 
 def slow_line(seconds: float, cpu_seconds: float) -> str | None:
-    """What to say where a command took ten times its CPU time; None where it did not.
+    """The message where a command took ten times its CPU time; None where it did not.
 
     Args:
         seconds: that it took.

@@ -82,7 +82,7 @@ def check_camera(K: Matrix, size: Size, where: str, remedy: str, near: bool) -> 
     """Refuse a principal point outside the image or, if it has to be ``near``, far from its middle; and odd focals.
 
     Raises:
-        ValueError: as said, with ``remedy``.
+        ValueError: as described above, with ``remedy``.
     """
     sides, point, focals = size[::-1], (float(K[0, 2]), float(K[1, 2])), (float(K[0, 0]), float(K[1, 1]))
     for side, focal, axis in zip(sides, focals, "xy", strict=True):

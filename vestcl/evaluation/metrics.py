@@ -25,7 +25,7 @@ LEVEL_WEIGHTS: Final = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 #: The smallest image side that still holds a window on MS-SSIM's coarsest level.
 MS_SSIM_SIDE: Final = WINDOW << (len(LEVEL_WEIGHTS) - 1)
 
-#: A car that moves less than this between two frames (metres) stands: an error in per cent of it means nothing.
+#: A car that moves less than this between two frames (metres) is static: an error in per cent of it is undefined.
 STANDSTILL: Final = 0.01
 
 

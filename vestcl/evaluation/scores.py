@@ -128,7 +128,7 @@ class Truth:
         """[3, H, W] of frame ``index``, at the size of the camera.
 
         Raises:
-            ValueError: no camera stood at ``view``.
+            ValueError: no camera at ``view``.
         """
         key = view.name, index
         if key not in self._full:
@@ -202,7 +202,7 @@ def predictions(truth: Truth, index: int, steps: int, views: Sequence[View], for
         forecasts: of all views, ``steps`` frames or more.
 
     Raises:
-        ValueError: no camera stood at a view.
+        ValueError: no camera at a view.
     """
     source = View(SOURCE, np.eye(4))
     current = truth.full(source, index)

@@ -1,4 +1,4 @@
-"""What windows' scores say together: intervals by resampling clips, differences between methods, the extreme windows.
+"""Statistics over windows: intervals by resampling clips, differences between methods, the extreme windows.
 
 Neighbouring windows of a clip show the same objects, so clips are what is drawn again, with all of their windows:
 

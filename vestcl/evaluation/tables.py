@@ -132,7 +132,7 @@ def horizon(step: int) -> str:
 
 
 def to_rich(grid: Grid) -> RenderableType:
-    """For the terminal; a heading's last word stands below the others."""
+    """For the terminal; a heading's last word is below the others."""
     table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
     for index, heading in enumerate(grid.heading):
         stacked = "\n".join(heading.rsplit(" ", 1))

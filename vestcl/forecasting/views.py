@@ -1,6 +1,6 @@
 """Cameras to show a forecast from, given in a few words: "source", "right", "left" or "0.5,0,0,yaw=-5".
 
-A camera stands at x metres to the right, y down and z forward of the source camera, along the source camera's axes,
+A camera is at x metres to the right, y down and z forward of the source camera, along the source camera's axes,
 and is turned: yaw > 0 to the right, pitch > 0 up, roll > 0 clockwise (its right side goes down, so the image turns
 counter-clockwise). Roll comes first, yaw last:
 
@@ -42,9 +42,9 @@ def parse_view(text: str, camera: Clip | Sample) -> View:
     - "left": as far to the left as the right camera is to the right, tgt_from_next = right_from_left^-1, with the
       source's K. No camera was ever there.
     - "x,y,z", and after it in any order "yaw=", "pitch=", "roll=", "fov=" (degrees) and "name=": a camera moved and
-      turned as the head of this file says. ``fov`` is horizontal: fx = W / (2 tan(fov / 2)), fy = fx fy0 / fx0 (the
-      pixels keep their shape), with the source's principal point. Without ``name`` it is made of what differs from the
-      source, "x0.5_yaw-5".
+      turned as described at the top of this file. ``fov`` is horizontal: fx = W / (2 tan(fov / 2)), fy = fx fy0 / fx0
+      (the pixels keep their shape), with the source's principal point. Without ``name`` it is made of what differs from
+      the source, "x0.5_yaw-5".
 
     Args:
         text: as above.
@@ -87,7 +87,7 @@ def parse_views(texts: Iterable[str], camera: Clip | Sample) -> list[View]:
 
 
 def seen_by(view: View, sample: Sample) -> Sample | RightCamera | None:
-    """The camera of the rig that stands where ``view`` does, whatever the view is called: its images are the truth.
+    """The rig's camera at the position of ``view``, whatever the view's name: its images are the truth.
 
     Args:
         view: a camera.

@@ -72,7 +72,7 @@ def check_chunks(content: bytes, part: ExrPart) -> None:
         part: the only one of the file.
 
     Raises:
-        ValueError: as said.
+        ValueError: as described above.
     """
     if part.tiled or part.compression >= len(_LINES):
         return

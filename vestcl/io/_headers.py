@@ -72,7 +72,7 @@ def check_whole(path: str | Path, content: bytes) -> None:
     """Refuse a PNG or JPEG that ends too early, and a PNG with a chunk that does not match its checksum.
 
     Raises:
-        ValueError: as said.
+        ValueError: as described above.
     """
     try:
         if content.startswith(_PNG):

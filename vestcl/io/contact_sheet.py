@@ -34,7 +34,7 @@ CELL_WIDTH: Final = 500
 #: What images lie on: light, so that letters can be read, and not white, so that a white image shows its edge.
 PAPER: Final = (232, 232, 232)
 
-#: Letters and the strip they stand in, px: legible where the sheet is shown at half its size.
+#: Letters and the strip they are in, px: legible where the sheet is shown at half its size.
 _FONT_SIZE: Final = 17
 _LINE: Final = 24
 _GAP: Final = 6

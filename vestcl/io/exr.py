@@ -201,7 +201,7 @@ def _silent() -> Iterator[None]:
 
 
 def _os_error(error: RuntimeError, path: str | Path) -> OSError:
-    """What OpenEXR's error says in words, as the operating system's error; EIO where the words are its own."""
+    """OpenEXR's error in words, as the operating system's error; EIO where the words are its own."""
     code = next((code for code in _WRITE_ERRORS if os.strerror(code).lower() in str(error).lower()), errno.EIO)
     return OSError(code, os.strerror(code), str(path))
 

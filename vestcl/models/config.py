@@ -133,7 +133,7 @@ class ObjectMotionConfig:
     detail: int = 8
     """Channels of branch B, at full resolution."""
     where: Literal["everywhere", "foreground"] = "everywhere"
-    """"foreground": what the mask says is static background keeps the motion that object motion starts from."""
+    """"foreground": static background by the mask keeps the motion that object motion starts from."""
     routing: RoutingConfig | None = None
     """None runs every block."""
     inpainted: bool = False
@@ -234,7 +234,7 @@ class ModelConfig:
     intervals_s: tuple[float, float] | None = None
     """The shortest and the longest of them, where a network learned at several; None is `interval_s`."""
     mode: Mode | None = None
-    """How frames after the first are forecast unless a call says otherwise; None follows `start`: "feedback" from rest,
+    """How frames after the first are forecast unless a call sets it; None follows `start`: "feedback" from rest,
     as the paper does, "compose" from a prior. `default_mode` has the answer."""
 
     def knows(self, seconds: float) -> bool:

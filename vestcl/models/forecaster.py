@@ -78,7 +78,7 @@ class Forecaster(
     """Encode, lift, forecast the camera's and then the objects' motion, displace, splat, refine.
 
     Both input frames become a cloud each: every pixel, and where foreground hides the background that is inpainted
-    behind it. Inpainted points move with the static world, all others as object motion says; without EMF
+    behind it. Inpainted points move with the static world, all others by object motion; without EMF
     all do. Both clouds go to t + 1 directly, and are splatted there into every camera that is asked for.
 
     Args:

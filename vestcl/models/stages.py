@@ -174,7 +174,7 @@ class Stages(nn.Module):
     def lift(self, prev: EncodedFrame, cur: EncodedFrame, motion: Motion, K: torch.Tensor) -> list[Cloud]:
         """Both frames' layers as clouds on their way to t + 1; with `RenderConfig.joint` as one.
 
-        Inpainted points follow the camera's motion. Without EMF there is none: they move as object motion says at their
+        Inpainted points follow the camera's motion. Without EMF there is none: they move by object motion at their
         pixel.
 
         Args:
@@ -203,7 +203,7 @@ class Stages(nn.Module):
         return [join(*clouds)] if render.joint else clouds
 
     def show(self, clouds: Sequence[Cloud], camera: Camera, motion: Motion, K: torch.Tensor) -> RenderedView:
-        """Splat each cloud into a camera, and paint the image.
+        """Splat each cloud into a camera, and compute the image.
 
         Args:
             clouds: from `lift`.

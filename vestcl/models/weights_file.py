@@ -9,7 +9,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-#: Parts of a parameter's name that wrappers add: `DistributedDataParallel` and its like, and `torch.compile`.
+#: Parts of a parameter's name that wrappers add: `DistributedDataParallel` and similar, and `torch.compile`.
 _WRAPPERS: Final = ("module", "_orig_mod")
 
 #: Names that an error lists before it only counts them.

@@ -1,4 +1,4 @@
-"""What a process may still do with OpenCL after it was forked: nothing, and it says so."""
+"""What a process may still do with OpenCL after it was forked: nothing, with an error."""
 
 import ctypes
 import os

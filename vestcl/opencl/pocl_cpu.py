@@ -3,7 +3,7 @@
 PoCL asks LLVM for the host CPU's name and hands it to clang as ``-target-cpu``. The LLVM 14 inside PoCL 3.0 knows
 no CPU later than 2022 (Zen 4, Sapphire Rapids, ...), answers "generic", and clang refuses that name on x86:
 every build fails with ``unknown target CPU 'generic'`` (pocl issue 1049). PoCL 3.1 and later fall back
-to the name that stands for the instruction set instead. We do the same from outside: find the pointer to
+to the name of the instruction set instead. We do the same from outside: find the pointer to
 "generic" in PoCL's device structure and point it to that name. Nothing is touched on any other driver,
 version or architecture.
 """
@@ -14,7 +14,7 @@ import os
 import struct
 from pathlib import Path
 
-#: (instruction sets a CPU must have, the LLVM name that stands for them), best first; the same pairs as PoCL 3.1's.
+#: (instruction sets a CPU must have, the LLVM name of them), best first; the same pairs as PoCL 3.1's.
 _NAMES = (
     ({"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}, b"skylake-avx512"),
     ({"avx2", "fma", "bmi1", "bmi2", "f16c"}, b"haswell"),

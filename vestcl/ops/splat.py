@@ -75,7 +75,7 @@ def splat(
     unless the gradient of the opacities is asked for. `skipped` counts them.
 
     Clouds of different sizes cost no padding when they are packed: concatenate the points of all clouds (without the
-    leading B), and say in ``cloud_starts`` where each begins. Dense clouds padded with points of radius 0 work too; a
+    leading B), and give in ``cloud_starts`` where each begins. Dense clouds padded with points of radius 0 work too; a
     padded point is read once and then costs nothing.
 
     Args:
@@ -94,7 +94,7 @@ def splat(
             [P, 2], z, radii, opacities [P] and features [P, C].
 
     Returns:
-        image [B, C, H, W] in channels-last memory (what a torch convolution on a CPU likes best) and coverage
+        image [B, C, H, W] in channels-last memory (fastest for torch convolutions on a CPU) and coverage
         [B, 1, H, W], of the kind and dtype that came in; differentiable in all but z, once: a second derivative
         raises NotImplementedError. Both may be changed in place.
 

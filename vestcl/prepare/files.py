@@ -236,7 +236,7 @@ def read_tensors(
         raise ValueError(f"{path}: is missing; {REMEDY}") from error
     except DAMAGE as error:
         raise damaged(path, error) from error
-    raise ValueError(f"{path}: was computed from other frames than {JSON} tells; {REMEDY}")
+    raise ValueError(f"{path}: was computed from other frames than {JSON} lists; {REMEDY}")
 
 
 def restore_frame(folder: Path, index: int, key: str, size: tuple[int, int], others: Mapping[str, Shape]) -> None:

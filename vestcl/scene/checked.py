@@ -1,4 +1,4 @@
-"""What the arrays of a frame must be, said once: [C, H, W], numbers, one size."""
+"""Checks of a frame's arrays: [C, H, W], numbers, one size."""
 
 from typing import Any
 
@@ -71,7 +71,7 @@ def _check_shape(name: str, array: NDArray[Any], channels: int, like: NDArray[An
 
 
 def pixels(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """[C, H, W] in [0, 1] as OpenCV wants it: [H, W, C] uint8; what is outside the range is clipped."""
+    """[C, H, W] in [0, 1] as OpenCV needs it: [H, W, C] uint8; what is outside the range is clipped."""
     scaled = image.clip(0, 1)
     scaled *= 255
     return np.ascontiguousarray(np.rint(scaled, out=scaled).astype(np.uint8).transpose(1, 2, 0))

@@ -31,7 +31,7 @@ class Perception(Measurements):
     What the clip's sources give is copied, so they may fill one buffer again and again. Threads may share a
     `Perception`; one computes at a time.
 
-    ``seconds`` tells the time by stage. Depth comes from the clip (scans are densified), else from its stereo pair,
+    ``seconds`` holds the time by stage. Depth comes from the clip (scans are densified), else from its stereo pair,
     else from motion; a network's depth of a clip without a stereo pair is combined with motion's (`combine_depth`). A
     depth map without a valid pixel is as a missing one, and is logged. Masks are from labels where every frame has
     them, else all from motion: frames t - 1 and t must have theirs from one source, and Cityscapes labels one frame of
@@ -146,7 +146,7 @@ class Perception(Measurements):
         if index == 0:
             return Moving(instances, np.zeros_like(surface.image))
         depth = self.raw_depth(index)
-        # Two depths whose scales may differ by more than an object moves say nothing.
+        # Two depths whose scales may differ by more than an object moves are not used.
         scaled = self.is_monocular(index) or self.is_monocular(index - 1)
         before = np.zeros_like(depth) if scaled else self.raw_depth(index - 1)
         measured = depth, before, self.inverse_std(index)

@@ -61,7 +61,7 @@ class LensCamera:
 
 @dataclass(frozen=True, eq=False)
 class CameraFile:
-    """What a camera.json says."""
+    """The content of a camera.json."""
 
     path: Path
     camera: LensCamera

@@ -1,6 +1,6 @@
 """A video file without calibration: a pinhole camera of a stated field of view, principal point in the middle.
 
-Pixels are as wide and high as the file says (its sample aspect ratio a, width over height): fy = a fx.
+A pixel's width over its height is the file's sample aspect ratio a: fy = a fx.
 """
 
 from pathlib import Path

@@ -82,7 +82,7 @@ USUAL: Final = Driven()
 
 @dataclass(frozen=True)
 class StreetInput:
-    """What the text of an input says."""
+    """The content of an input's text."""
 
     seeds: range | None
     """None without a seed."""

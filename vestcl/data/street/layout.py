@@ -36,7 +36,7 @@ Part = tuple[Solids, float]
 
 @dataclass(frozen=True)
 class Layout:
-    """What of a street decides where objects stand."""
+    """What of a street decides where objects are."""
 
     seed: int
     kerb: float

@@ -1,4 +1,4 @@
-"""What sensors and classifiers would say of a street's frame: sparse laser scans, and classes with errors."""
+"""Simulated sensors and classifiers for a street's frame: sparse laser scans, and classes with errors."""
 
 from dataclasses import dataclass
 from typing import Final

@@ -2,8 +2,8 @@
 
 World axes: x right, y down, z forward along the road, metres; the road is y = 0 and its centre line x = 0. Traffic
 keeps right, and never ends: see vestcl/data/street/layout.py and street_traffic.py. How the camera drives:
-street_drive.py. With a `RoadDrive` the street bends along its course: what is said of x and z holds across it and along
-it.
+street_drive.py. With a `RoadDrive` the street bends along its course: the statements about x and z hold across it and
+along it.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """The convolutional trunks of public ImageNet classifiers: feature maps that distances between images are taken in.
 
 Layers and names are torchvision's (``features.0.weight``, ...), so its state dicts load as they are; torchvision is
-not needed. A trunk ends at the last map that is taken and knows how its weights want their images normalised.
+not needed. A trunk ends at the last map that is taken and knows how images are normalised for its weights.
 """
 
 import zipfile

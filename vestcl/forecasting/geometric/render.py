@@ -65,10 +65,10 @@ def show(
         tgt_from_next: [4, 4] m.
         height: px.
         width: px.
-        where: [1, H, W], True in the pixels that are wanted; None wants all.
+        where: [1, H, W], True in requested pixels; None: all.
 
     Returns:
-        The composition; 0 where nothing is, and in pixels that are not wanted.
+        The composition; 0 where nothing is, and in pixels that are not requested.
     """
     wanted = np.arange(height * width) if where is None else np.flatnonzero(where)
     planes, left = np.zeros((7, len(wanted)), np.float32), np.ones(len(wanted), np.float32)
@@ -98,7 +98,7 @@ def show(
 
 @dataclass(frozen=True, eq=False)
 class _Requested:
-    """The pixels of a view that are wanted, flat."""
+    """The requested pixels of a view, flat."""
 
     height: int
     width: int
@@ -108,7 +108,7 @@ class _Requested:
     """[L], those of them whose colour is, too; None = of the same."""
 
     def of_view(self) -> NDArray[np.intp] | None:
-        """Those whose colour is wanted; None = all."""
+        """Pixels whose colour is requested; None = all."""
         return self.covered if self.coloured is None else self.coloured
 
 

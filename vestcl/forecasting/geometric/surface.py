@@ -24,7 +24,8 @@ ONE_SURFACE: Final = 1.5
 #: What makes a point at an edge count as of several surfaces, px^2: a tenth of the composite is enough.
 _EDGE: Final = 10 * ONE_SURFACE**2
 
-#: The area that a pixel of the source grows to, as a factor of what its depth says, lies in this range on a surface.
+#: The area that a pixel of the source grows to, as a factor of what follows from its depth, lies in this range on a
+#: surface.
 _GROWTH: Final = (0.2, 5.0)
 
 #: Squared positions are carried in thousands of pixels, so that float32 keeps their differences.

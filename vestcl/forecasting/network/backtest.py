@@ -6,7 +6,7 @@ t - h that is forecast to be at q in t, with what refinement adds there, a(q):
     e = mean min(|I_(t-h)(p) + a(q) - I_t(q)|^2, MOST)  over a grid of pixels that are in the image either way
 
 Camera first, then objects under the camera's result, then refinement under both, at t from t - 1. What wins there is
-tested at t - 1 from t - 2, as one frame says little of the next; and motion at t from t - 2, as it is extrapolated
+tested at t - 1 from t - 2, as one frame says little about the next; and motion at t from t - 2, as it is extrapolated
 further. What can't be tested is left out. A test takes the networks on two frames once, of which a sequence has encoded
 all already, and for refinement one view. A refinement of geometric forecasts is tested on such a forecast of t itself,
 pixel by pixel; what earlier frames are remembered for is not in it.

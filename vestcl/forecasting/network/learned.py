@@ -94,7 +94,7 @@ def given_motion(perception: Perception, index: int, path: CameraPath) -> Networ
 
 
 def corrections(model: Forecaster, given: NetworkInput, steps: int) -> Corrections:
-    """What ``model`` says of the motion, without showing anything."""
+    """The motion by ``model``, without rendering."""
     done = model.forecast(
         given.frame_prev, given.frame_cur, given.K, steps, [], "compose", prior=given.prior, own=given.own
     )

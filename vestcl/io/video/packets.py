@@ -1,4 +1,4 @@
-"""What a video's packets say without being decoded: which frames there are, when each is shown, where the keys are.
+"""Information from a video's packets, without decoding: which frames there are, when each is shown, where the keys are.
 
 A header's count and rate are claims; packets are what is there. Reading all of them takes half a second per hour of
 video, since their content is not looked at.

@@ -18,7 +18,7 @@ _ABANDONED: Final[list[Decoder]] = []
 
 
 class Video:
-    """A video's frames by number, [H, W, 3] uint8 RGB, turned as the file says they are to be displayed.
+    """A video's frames by number, [H, W, 3] uint8 RGB, turned as the file's display matrix requires.
 
     Frames are counted by reading the file's packets, so the count is what is there, whatever the header claims. A frame
     is decoded from the key frame before it on; going forward is quick. Threads may share a video; pickled, or in a

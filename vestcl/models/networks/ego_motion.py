@@ -25,7 +25,7 @@ LONGEST_WAVE: Final = 10_000.0
 #: A prior's rotations, radians, are shown to the network times that, and are then as large as its translations, metres.
 _TURN_SHOWN: Final = 100.0
 
-#: What the network says of a correction is times that, radians and metres: the largest that a car makes in an interval,
+#: Factors of the network's correction, radians and metres: the largest that a car makes in an interval,
 #: so that Adam's first steps, all of one size, are small ones of motion.
 _TURN_SAID, _SHIFT_SAID = 0.03, 0.1
 

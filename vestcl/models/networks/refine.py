@@ -27,7 +27,7 @@ class Refine(nn.Module):
     bilinear x2, joined with the level's second conv, conv, joined with its first conv, conv; the last up is joined
     with the stem, and a conv makes three channels. Convs are 3x3 with GroupNorm and PReLU.
 
-    Without a base it paints sigmoid(y). With one it gives b + y, with y exactly 0 at the start; out of training that
+    Without a base it returns sigmoid(y). With one it gives b + y, with y exactly 0 at the start; out of training that
     is clamped to [0, 1]. "splatted" takes the rendered colour (premultiplied with coverage), current frame over
     previous frame, b = c_cur + (1 - coverage_cur) c_prev. "filled" takes colours divided by coverage, opaque from
     OPAQUE on, the current frame over the previous one, and `fill`s what is left.

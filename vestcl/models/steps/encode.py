@@ -19,7 +19,7 @@ def encode(
 
     Args:
         encoder: the network.
-        config: of it; says what a background is normalised by.
+        config: its configuration, with the background's normalisation.
         layers: of B frames.
         options: with ``background`` the background is encoded where it has to be.
         tally: is passed how much that left out.

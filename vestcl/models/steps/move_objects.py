@@ -17,7 +17,7 @@ from vestcl.models.steps.frames import FOREGROUND_BELOW, EncodedFrame
 #: From t - 1 and from t to t + 1; OMF runs at the interval that it learned at, of evenly spaced frames.
 _INTERVALS: Final = (2, 1)
 
-#: What is slower, metres per interval, stands: at 10 Hz half of a brisk walk ...
+#: What is slower, metres per interval, is static: at 10 Hz half of a brisk walk ...
 SLOWEST: Final = 0.08
 
 #: ... in the mean over cells of this many pixels per side.

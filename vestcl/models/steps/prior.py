@@ -118,8 +118,8 @@ def repeated(
 ) -> MotionPrior:
     """The prior of the step after: the camera's motion G once more, and what moved next to it as it did.
 
-    What is seen at x came m over the interval, so in addition to the camera's motion by s = x - G (x - m), whatever the
-    mask says of it: shadows and errors of depth have velocities, too. The frame before has R^-1 of what its pixels
+    What is seen at x came m over the interval, so in addition to the camera's motion by s = x - G (x - m), regardless
+    of the mask: shadows and errors of depth have velocities, too. The frame before has R^-1 of what its pixels
     moved in addition to the rigid flow.
 
     Args:

@@ -21,7 +21,7 @@ from vestcl.shapes import check
 
 #: Metres that inpainted points go farther back in the splatter's order, where they come last: what a frame has not seen
 #: never hides what it has. An inpainted point is static 1 % behind the object that hides it, and a car that drives
-#: ahead of us would soon be behind the road that it was painted over.
+#: ahead of us would soon be behind the road that it is drawn over.
 _BEHIND: Final = 4 * SKY_DEPTH
 
 #: Points are picked for open pixels where no more of them are left than that: picking takes time, too.

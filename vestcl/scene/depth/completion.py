@@ -15,7 +15,7 @@ _STRENGTH, _EDGES = 20.0, 4.0
 #: Its damping from round to round, and its rounds: OpenCV's own.
 _DAMPING, _ROUNDS = 0.25, 3
 
-#: Nothing is set farther than that for want of anything better, metres.
+#: Nothing is set farther than that without better information, metres.
 _FAR: Final = 500.0
 
 

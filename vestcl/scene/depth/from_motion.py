@@ -66,7 +66,7 @@ def motion_depth(
     """1/z from p' ~ K (R K^-1 p + t/z) for the flow p -> p' to up to two earlier images; metres by the road.
 
     The camera's motion is the essential matrix of the flow. The plane n . x = ``camera_height`` that fits the points
-    in the lower middle gives the scale. Where parallax is weak the plane stands in; what moves along on it takes the
+    in the lower middle gives the scale. Where parallax is weak the plane is used; what moves along on it takes the
     depth of its foot; the image's edges guide what is spread over the rest. Where the camera is static or only turns,
     the depth is that of a level road, and no more than a guess.
 

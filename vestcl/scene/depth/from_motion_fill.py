@@ -65,7 +65,7 @@ class Standing(NamedTuple):
 def standing(inverse: Array, std: Array, moving: NDArray[np.bool_], road: Array, at_rest: bool = False) -> Standing:
     """Objects that are farther than the road behind them by their flow, or leave their epipolar line: they move.
 
-    A connected region of such pixels is one object. It stands where its lowest pixels touch the road. While the camera
+    A connected region of such pixels is one object. It is where its lowest pixels touch the road. While the camera
     drives only parts of it are found, and it fills their convex hull; at rest its outline is known.
 
     Args:

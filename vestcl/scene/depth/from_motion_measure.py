@@ -11,7 +11,7 @@ from vestcl.scene.flow.correspondence import Correspondence
 from vestcl.scene.flow.parallax import epipolar, moved_pixels
 from vestcl.scene.flow.pose import Pose
 
-#: Forward-backward error, and distance to the epipolar line, beyond which flow says nothing of depth, px.
+#: Forward-backward error, and distance to the epipolar line, beyond which flow gives no depth, px.
 _FLOW_ERROR, _OFF_LINE = 1.0, 1.0
 
 #: Error of the flow along the line, px: a constant, and a share of the flow, as long flow is found less well.

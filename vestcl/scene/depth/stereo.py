@@ -67,7 +67,7 @@ def stereo_depth(
         left: [3, H, W] RGB in [0, 1], rectified: no distortion, rows correspond. Full size is best.
         right: [3, H, W] likewise.
         K: [3, 3] px, of both.
-        right_from_left: [4, 4] m, a shift along x alone (1 mrad and 5 % of the baseline are forgiven); t_x < 0.
+        right_from_left: [4, 4] m, a shift along x only (1 mrad and 5 % of the baseline are tolerated); t_x < 0.
         max_disparity: px, the largest that is searched, rounded up to a multiple of 16; None finds what is 3 m away.
         far: m; greater depths are set to it.
         fill: whether pixels that fail the left-right check have a depth, from the filter.

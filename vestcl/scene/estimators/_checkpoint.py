@@ -41,7 +41,7 @@ class Checkpoint:
     config: Any
     """transformers' configuration of the network."""
     preparation: dict[str, Any]
-    """What preprocessor_config.json says."""
+    """The content of preprocessor_config.json."""
     network: str
     """The class in transformers."""
     local_files_only: bool

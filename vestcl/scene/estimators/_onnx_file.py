@@ -1,4 +1,4 @@
-"""What an ONNX file says of its inputs and outputs: a reader of the few protobuf fields that hold it.
+"""An ONNX file's description of its inputs and outputs: a reader of the few protobuf fields that hold it.
 
 Field numbers are those of onnx.proto3: ModelProto.graph = 7; GraphProto.initializer = 5, .input = 11, .output = 12;
 ValueInfoProto.name = 1, .type = 2; TypeProto.tensor_type = 1; TypeProto.Tensor.elem_type = 1, .shape = 2;

@@ -71,9 +71,9 @@ class Description:
     size: tuple[int, int] | None = None
     colour: str = "RGB"
     scale: float | None = None
-    """None is as the input's type wants it: 1/255, or 1 for uint8."""
+    """None: the default for the input's type: 1/255, or 1 for uint8."""
     mean: tuple[float, ...] | None = None
-    """One per channel; None is as the input's type wants it: ImageNet's for classes, and 0 for depth and for uint8."""
+    """One per channel; None: default of the input type: ImageNet's for classes, and 0 for depth and for uint8."""
     std: tuple[float, ...] | None = None
     fit: str = "stretch"
     metres: float = 1.0

@@ -205,7 +205,7 @@ def _layout(description: Description, value: Value) -> tuple[str, tuple[int, int
 
 
 def _example(axis: str | None, index: int) -> str:
-    """What stands for a dynamic axis in the remedy: 1 for the batch, letters for a size."""
+    """The value of a dynamic axis in the remedy: 1 for the batch, letters for a size."""
     return "1" if index == 0 else re.sub(r"\W", "", axis or "") or "N"
 
 

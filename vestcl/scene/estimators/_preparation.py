@@ -1,4 +1,4 @@
-"""From an image to what a network wants to see: reflected edges, another size, other units."""
+"""From an image to a network's input: reflected edges, another size, other units."""
 
 import math
 from collections.abc import Mapping
@@ -51,7 +51,7 @@ class Preparation:
 
     @classmethod
     def read(cls, name: str, config: Mapping[str, Any], *, zoe: bool, size: tuple[int, int] | None) -> "Preparation":
-        """What preprocessor_config.json says.
+        """The content of preprocessor_config.json.
 
         Args:
             name: of the checkpoint, for messages.

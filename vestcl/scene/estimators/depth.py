@@ -77,8 +77,8 @@ class DepthEstimator(Estimator[np.float32]):
             name_or_path: a folder, or a name on huggingface.co: it is **downloaded** when first used (0.1 to 1.4 GB)
                 and kept in the hub's own cache. `Intel/zoedepth-nyu-kitti`, `Intel/zoedepth-kitti`,
                 `depth-anything/Depth-Anything-V2-Metric-Outdoor-Small-hf` (or Base, Large).
-            size: (height, width) px at which the network sees images, rounded to its multiples; None is as the
-                checkpoint says: the image's proportions, 384 px (ZoeDepth) or 518 px (Depth Anything) high.
+            size: (height, width) px at which the network sees images, rounded to its multiples; None: the checkpoint's
+                size: the image's proportions, 384 px (ZoeDepth) or 518 px (Depth Anything) high.
             flip: average with the mirrored image, at twice the time; None is as published: ZoeDepth does.
             device: of torch.
             local_files_only: whether nothing may be downloaded. Without it and without a network, some 20 s pass before

@@ -47,7 +47,7 @@ class SegmentationEstimator(Estimator[np.uint8]):
             name_or_path: a folder, or a name on huggingface.co: it is **downloaded** when first used (15 MB to 1 GB)
                 and kept in the hub's own cache. `nvidia/segformer-b0-finetuned-cityscapes-1024-1024` (to b5),
                 `facebook/mask2former-swin-tiny-cityscapes-semantic` (or small, large).
-            size: (height, width) px at which the network sees images; None is as the checkpoint says, which is
+            size: (height, width) px at which the network sees images; None: the checkpoint's size, which is
                 often a square whatever the image's proportions. A size of the image's own proportions keeps cars
                 and people as the network has learnt them.
             device: of torch.

@@ -101,7 +101,7 @@ def with_estimates(
     Args:
         clip: of any reader, resized or not.
         depth: [3, H, W] RGB in [0, 1] -> [1, H, W] m, 0 = unknown: a `DepthEstimator` or any function; None leaves
-            the clip's own. An attribute ``metric`` that is False says that it is in no unit, as `OnnxDepth.metric`.
+            the clip's own. An attribute ``metric`` that is False means that it has no unit, as `OnnxDepth.metric`.
         segmentation: [3, H, W] -> [1, H, W] uint8 train ids, 255 = void: a `SegmentationEstimator` or any function;
             None leaves the clip's own.
 

@@ -14,7 +14,7 @@ from vestcl.scene.flow.correspondence import Correspondence, check_size
 #: Standard deviation of dense inverse search where its flow returns, px (0.2 and 0.35 serve equally well).
 _FLOW_STD: Final = 0.25
 
-#: Forward-backward error, and distance to the epipolar line, beyond which flow says nothing of depth, px.
+#: Forward-backward error, and distance to the epipolar line, beyond which flow gives no depth, px.
 _FLOW_ERROR, _OFF_LINE = 1.0, 1.0
 
 #: Depth and flow agree if they differ, along the line, by fewer pixels plus that share of the flow.

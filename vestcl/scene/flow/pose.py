@@ -10,7 +10,7 @@ from vestcl.scene.flow.correspondence import Correspondence
 from vestcl.scene.flow.parallax import moved_pixels, pixel_centres
 from vestcl.scene.motion.ego_motion import rigid
 
-#: Every which pixel, both ways, takes part: neighbours of a dense flow say the same.
+#: Every which pixel, both ways, takes part: neighbours of a dense flow are redundant.
 _STRIDE: Final = 6
 
 #: Forward-backward error beyond which flow is not believed, px.
@@ -23,7 +23,7 @@ _OFF_LINE, _BEND = 0.7, 0.3
 #: half, where a road would stream past, the camera has not moved.
 _TURNED, _STILL_SHARE = 0.6, 0.6
 
-#: Fewer points than that say nothing.
+#: Fewer points than that are not used.
 _FEWEST: Final = 50
 
 #: Gauss-Newton rounds; a pose from RANSAC is there after five.

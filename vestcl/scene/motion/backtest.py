@@ -88,7 +88,7 @@ def candidates(
 
     The candidates: its object's velocity; rest in the world; rest and ``ahead`` times the residual flow r; rest and r
     followed from position to position, as objects that come to the end of where r was seen slow down in the mean. With
-    ``by_flow`` also, last, flow itself, p - ahead flow / elapsed: it knows of no depth, which may be far off where it
+    ``by_flow`` also, last, flow itself, p - ahead flow / elapsed: it uses no depth, which may be far off where it
     comes from motion.
 
     Args:

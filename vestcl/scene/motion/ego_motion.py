@@ -11,7 +11,7 @@ from vestcl.data.calibration import power
 from vestcl.scene import checked
 from vestcl.scene.flow.correspondence import Correspondence, check_size
 
-#: Every which pixel, both ways, takes part: neighbours of a dense flow say the same.
+#: Every which pixel, both ways, takes part: neighbours of a dense flow are redundant.
 _STRIDE: Final = 4
 
 #: Forward-backward error beyond which flow is not believed, px.

@@ -32,7 +32,7 @@ def motion_mask(
     """M: False where |p + flow(p) - project(K (R x + t))| exceeds what errors of depth explain, over whole regions.
 
     Args:
-        depth: [1, H, W] m; 0 = invalid, of which nothing is said: such pixels count as background.
+        depth: [1, H, W] m; 0 = invalid, without a result: such pixels count as background.
         correspondence: from that frame to another one.
         dst_from_src: [4, 4] m, the camera's motion between them.
         K: [3, 3] px.

@@ -32,10 +32,10 @@ _CORRELATED: Final = 50.0
 #: nothing jumps.
 _SPEED_STD: Final = (2.0, 0.1, 2.0)
 
-#: An object is said to move if that explains its flow so much better: mean robust cost, in variances of flow.
+#: An object counts as moving if that explains its flow so much better: mean robust cost, in variances of flow.
 _GAIN: Final = 1.5
 
-#: Pixels of an object that take part, evenly chosen: neighbours say the same.
+#: Pixels of an object that take part, evenly chosen: neighbours are redundant.
 _PIXELS: Final = 3000
 
 #: Residual flow beyond this many pixels is a wrong match, not motion, and below this many it is noise.

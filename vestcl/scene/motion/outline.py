@@ -44,8 +44,8 @@ def whole_objects(
     """``moving`` and the pixels around it that look more like the frame before by the motion of what they are next to.
 
     Pixel p is added if G(w (|I(p) - I_prev(b(p))| - |I(p) - I_prev(p + f)|)) / G(w) > NOISE, with G smoothing up to the
-    edges of the image, and w = 0 where the object was in front of the background before, which then says nothing.
-    Small holes and narrow gaps are filled: there both motions may look the same.
+    edges of the image, and w = 0 where the object was in front of the background before, which then gives no
+    information. Small holes and narrow gaps are filled: there both motions may look the same.
 
     Args:
         moving: [H, W].

@@ -1,6 +1,6 @@
 """Which velocities the images confirm: what moves by v looks in the frame before, at x - v, as it does now.
 
-Flow is wrong where it is large, on cars that pass close by above all, and says of those that are parked that they move.
+Flow is wrong where it is large, on cars that pass close by above all, and makes parked cars appear to move.
 What an image shows of a wrong motion is something else.
 """
 
@@ -106,7 +106,7 @@ class Pair(NamedTuple):
 
 
 def search(instances: NDArray[np.int32], by_flow: Array, depth: NDArray[np.float32], pair: Pair) -> Array:
-    """v_n [n + 1, 3] m per frame for each object: of 0, what flow says, and steps ahead and aside, what matches
+    """v_n [n + 1, 3] m per frame for each object: of 0, the velocity by flow, and steps ahead and aside, what matches
     best.
 
     min over v of the mean over pixels of min(|I(p) - I_prev(project(K (R (x - v) + t)))|, OTHER), first along the
