@@ -11,7 +11,7 @@ from vestcl.models import shipped
 from vestcl.models.checkpoint import write_checkpoint
 from vestcl.models.forecaster import Forecaster
 
-#: The most that a file in the package may have, bytes.
+#: The largest amount that a file in the package may have, bytes.
 LARGEST = 20e6
 
 

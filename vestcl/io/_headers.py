@@ -117,7 +117,7 @@ def _check_png(content: bytes) -> None:
 
 
 def _markers(content: bytes) -> Iterator[tuple[int, int]]:
-    """Each marker but the bare ones, with the position after it; coded data between them is passed over.
+    """Each marker but the bare ones, with the position after it; coded data between them is skipped.
 
     Raises:
         _DamagedError: the content ends before the end of the image.

@@ -58,7 +58,7 @@ OPAQUE: Final = 0.5
 #: Planes that refinement of geometric forecasts is shown: `vestcl.forecasting.network.planes`.
 FORECAST_PLANES: Final = 7
 
-#: The most that it changes a colour by, of 1, where a pixel is covered; where nothing covers it, by 1.
+#: The largest amount that it changes a colour by, of 1, where a pixel is covered; where nothing covers it, by 1.
 MOST_CHANGE: Final = 0.25
 
 #: The same as RHO where colour is shown directly, and refinement only adds to it (SPEC section 2).

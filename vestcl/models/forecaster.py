@@ -125,24 +125,24 @@ class Forecaster(
             steps: number of future frames.
             views: the cameras to show, as (tgt_from_next [B, 4, 4], K [B, 3, 3]), each at its own future time; None
                 is the source camera only; none at all forecasts motion, with "compose" only.
-            mode: "feedback" takes each forecast frame, as the source camera sees it, for an input of the next step;
-                no gradient passes from step to step. "compose" encodes nothing again: the camera continues as was
+            mode: "feedback" feeds each forecast frame, seen from the source camera, back as input of the next step,
+                without gradients between steps. "compose" does not encode again: the camera continues as
                 forecast at t, and repeats its last motion beyond that; objects repeat their motion in the world. None
                 is `ModelConfig.default_mode`.
             perceive: for "feedback", (image [B, 3, H, W], depth [B, 1, H, W] m with 0 = unknown, mask [B, 1, H, W])
                 -> layers of that forecast frame; None is `perceive_forecast`.
-            prior: motion that was measured, for models that start from it and no others; with "feedback" later steps
+            prior: motion that was measured, only for models that start from it; with "feedback" later steps
                 continue with the motion that the first one forecast, which is not corrected again.
             own: [B, 1, H, W], 1 where the recording car itself is in the images, which EMF's attention and mean leave
                 out; it stays there in later frames. None is nowhere.
             shown: steps k to show, of 1 ... steps; None shows all.
 
         Returns:
-            One `Step` a future frame; differentiable in parameters and images.
+            One `Step` per future frame; differentiable in parameters and images.
 
         Raises:
             ValueError: an argument of another shape, a depth that is not above 0, less than one step, another mode,
-                or a prior that is missing or not wanted.
+                or a prior that is missing or not expected.
         """
         self._check(frame_prev, frame_cur, K, prior, own)
         mode = mode or self.config.default_mode
@@ -211,7 +211,7 @@ class Forecaster(
     def _show_all(
         self, clouds: Sequence[Cloud], cameras: Sequence[Camera], motion: Motion, K: torch.Tensor
     ) -> list[RenderedView]:
-        """`show` in each camera, and in one that comes twice once."""
+        """`show` in each camera, a repeated one only once."""
         views: list[RenderedView] = []
         for camera in cameras:
             known = known_view(cameras[: len(views)], views, camera) if self.options.views else None
@@ -252,7 +252,7 @@ class Forecaster(
 
     @classmethod
     def from_pretrained(cls, name: Path | str, **options: Any) -> "Forecaster":  # type: ignore[override]
-        """A trained network, in evaluation mode, on the CPU, in float32 in whatever precision its file is.
+        """A trained network, in evaluation mode, on the CPU, in float32, regardless of the file's precision.
 
         Args:
             name: "vest-s", which ships with vestcl; a .safetensors file; a folder that `save_pretrained` or training

@@ -1,4 +1,4 @@
-"""What is measured of a clip's frames without a network: images, optical flow, depth, camera motion. Kept by frame."""
+"""Measurements of a clip's frames without a network: images, optical flow, depth, camera motion. Kept by frame."""
 
 import logging
 import math
@@ -31,8 +31,8 @@ _INVERSE_STD: Final = 0.002
 #: Depth maps with a smaller share of valid pixels are scans, to be densified.
 _DENSE: Final = 0.3
 
-#: From this many intervals on there is a gap between two frames. It is too long if flow is believed (its error forth
-#: and back, px) at less than that share of the pixels that it is believed at between the two frames before.
+#: From this many intervals on there is a gap between two frames. It is too long if flow is trusted (its error forth
+#: and back, px) at less than that share of the pixels that it is trusted at between the two frames before.
 _GAP, _BELIEVED, _LOST = 1.5, 1.0, 0.6
 
 #: A bonnet is looked for in this many of the last images.
@@ -66,7 +66,7 @@ class Measurements(KeptResults):
         return self.once("flow", index, lambda: correspond(self.image(index), self.image(index - 1)))
 
     def raw_depth(self, index: int) -> NDArray[np.float32]:
-        """[1, H, W] m as it was measured, 0 = invalid."""
+        """[1, H, W] m as measured, 0 = invalid."""
         return self.once("depth", index, lambda: self._depth(index))
 
     def prev_from_cur(self, index: int) -> NDArray[np.float64]:
@@ -77,7 +77,7 @@ class Measurements(KeptResults):
         """`prev_from_cur` of consecutive frames, all in the scale of the last one where depth comes from motion.
 
         There each frame's road gives it its own scale; parallax over three images gives the ratio of their speeds.
-        Where it does not, as in the first moment of a drive, the motion before is taken to be as fast.
+        Where it does not, as in the first moment of a drive, the same speed is assumed for the motion before.
 
         Args:
             indices: of the frames, rising by one.
@@ -95,7 +95,7 @@ class Measurements(KeptResults):
         return motions
 
     def scale_before(self, index: int) -> float:
-        """What lengths in the scale of frame ``index`` - 1 are multiplied with to be in that of frame ``index``."""
+        """Factor of lengths in the scale of frame ``index`` - 1 to that of frame ``index``."""
         if index < 2 or not self._is_from_motion(index):
             return 1.0
         now, before = (float(np.linalg.norm(self.prev_from_cur(i)[:3, 3])) for i in (index, index - 1))

@@ -1,4 +1,4 @@
-"""What can be known of a clip's frames without a network: masks, layers and objects, from what is measured."""
+"""Perception of a clip's frames without a network: masks, layers and objects from measurements."""
 
 from collections.abc import Callable
 from typing import Final
@@ -33,7 +33,7 @@ class Perception(Measurements):
 
     ``seconds`` holds the time by stage. Depth comes from the clip (scans are densified), else from its stereo pair,
     else from motion; a network's depth of a clip without a stereo pair is combined with motion's (`combine_depth`). A
-    depth map without a valid pixel is as a missing one, and is logged. Masks are from labels where every frame has
+    depth map without a valid pixel is treated as missing, and logged. Masks are from labels where every frame has
     them, else all from motion: frames t - 1 and t must have theirs from one source, and Cityscapes labels one frame of
     30. Across a gap in time that is too long to match the frames on both sides of it, the camera moves on at the
     velocity before, and depth from motion is that of a level road; see `is_lost`.
@@ -65,7 +65,7 @@ class Perception(Measurements):
     def surface(self, index: int) -> Surface:
         """What the frame shows: `seen` without the background behind the foreground and without objects' velocities.
 
-        Frames before the last two are needed for no more.
+        Frames before the last two need nothing else.
         """
         return self._part("surface", index, lambda: self._find_surface(index))
 
@@ -82,7 +82,7 @@ class Perception(Measurements):
         return self.once("layers", index, lambda: self._see(index))
 
     def frame(self, index: int) -> backtest.BacktestFrame:
-        """The frame as candidate motions of its points are made and tested; at frame 0 nothing came from anywhere."""
+        """The frame in the form for candidate motions of its points; at frame 0 there is no earlier frame."""
         surface, K, image = self.surface(index), self.clip[index].K, self.image(index)
         asked = image, surface.depth, self.moving(index).velocity
         if index == 0:

@@ -1,4 +1,4 @@
-"""Sky without a network: smooth, bright, joined to the upper border, and nowhere near."""
+"""Sky without a network: smooth, bright, joined to the upper border, and never near."""
 
 from typing import Final
 

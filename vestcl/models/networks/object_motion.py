@@ -93,7 +93,7 @@ class ObjectMotion(nn.Module):
             The forecast; differentiable in all arguments.
 
         Raises:
-            ValueError: an argument of another shape, or backgrounds missing or not wanted.
+            ValueError: an argument of another shape, or backgrounds that are missing or not expected.
         """
         prev, cur = frame_pair(features_prev, features_cur, depth_prev, depth_cur, mask_prev, mask_cur, self.features)
         if len(backgrounds) != (4 if self.config.inpainted else 0):

@@ -36,7 +36,7 @@ _ASIDE, _ASIDE_COUNTS = 1 / 40, 0.002
 #: How well a foot gives the depth of an object, as a share of its inverse.
 _FOOT_STD: Final = 0.05
 
-#: A depth that is believed more than that separates white walls from the sky.
+#: A depth that is trusted more than that separates white walls from the sky.
 _SURE: Final = 0.5
 
 Array = NDArray[np.float64]
@@ -77,7 +77,7 @@ def motion_depth(
         correspondence: from the last image to the one before, where it is known already; it takes most of the time.
 
     Returns:
-        Depth of the last image, the motion to the one before, and how far the depth is to be believed.
+        Depth of the last image, the motion to the one before, and how far the depth is to be trusted.
 
     Raises:
         ValueError: fewer than two images, shapes, numbers that aren't finite, or a height that is not positive.

@@ -24,14 +24,14 @@ _ROAD_END: Final = 1 / 120
 #: Regions of dynamic objects of less than that share of the image's pixels are dropped.
 _SMALLEST: Final = 0.0006
 
-#: A region that fills that share of its convex hull is taken to be one object, a car, with holes in its flow.
+#: A region that fills that share of its convex hull is assumed to be one object, a car, with holes in its flow.
 _SOLID: Final = 0.6
 
 #: The column, of an object's columns sorted by the depth of their feet, whose depth the whole object takes.
 _FOOT: Final = 0.6
 
 #: Above an object, up to that many camera heights over the camera and down to that share of its foot's depth, its roof
-#: may be; what flow finds farther away there than this many 1/m is not believed, as the roof moves with the object.
+#: may be; what flow finds farther away there than this many 1/m is rejected, as the roof moves with the object.
 _TALL, _WAIST, _VEILED_BELOW = 0.45, 0.5, 0.008
 
 #: While the camera drives objects' depths spread to pixels up to that share of the image's width from them: 4 px of 640

@@ -31,7 +31,7 @@ _MOVED: Final = 2.0
 #: Fewer pixels than that compare nothing.
 _FEWEST: Final = 200
 
-#: A pose that fewer of the correspondences agree with is not believed.
+#: A pose that fewer of the correspondences agree with is rejected.
 _INLIERS: Final = 0.3
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ class Measured(NamedTuple):
     moving: NDArray[np.bool_]
     """[H, W], True where reliable flow leads off the epipolar line, or behind infinity."""
     lengths: list[float]
-    """Per view the length of its translation in units; 0 where it only turned or is not believed."""
+    """Per view the length of its translation in units; 0 where it only turned or is rejected."""
     speed_before: float = 0.0
     """Length of the motion to the last image but one over that of the motion to the last one; 0 = unknown."""
 

@@ -25,7 +25,7 @@ _AGREE, _AGREE_SHARE = 1.5, 0.05
 _WEAKEST: Final = 0.02
 
 #: Islands of up to this many pixels whose inverse depth differs from what surrounds them by more than so much, 1/m,
-#: are not believed: 0.003 / m is a disparity of 1 px on KITTI.
+#: are rejected: 0.003 / m is a disparity of 1 px on KITTI.
 _ISLAND, _ISLAND_STEP = 200, 0.003
 
 #: Inverse depths are counted in such steps, 1/m, for OpenCV's filter of islands, which takes integers.

@@ -13,7 +13,7 @@ from vestcl.scene.motion.ego_motion import rigid
 #: Every which pixel, both ways, takes part: neighbours of a dense flow are redundant.
 _STRIDE: Final = 6
 
-#: Forward-backward error beyond which flow is not believed, px.
+#: Forward-backward error beyond which flow is rejected, px.
 _FLOW_ERROR: Final = 0.5
 
 #: Distance to the epipolar line of RANSAC's inliers, and where the refinement's Cauchy loss bends, px.
@@ -41,7 +41,7 @@ class Pose(NamedTuple):
     dst_from_src: Array
     """[4, 4]; the translation is of length 1, or 0 if the camera only turned."""
     inliers: float
-    """Share of the believed flow that agrees."""
+    """Share of the trusted flow that agrees."""
 
 
 def relative_pose(correspondence: Correspondence, K: Array) -> Pose:

@@ -14,7 +14,7 @@ from vestcl.scene.flow.correspondence import Correspondence, check_size
 #: Every which pixel, both ways, takes part: neighbours of a dense flow are redundant.
 _STRIDE: Final = 4
 
-#: Forward-backward error beyond which flow is not believed, px.
+#: Forward-backward error beyond which flow is rejected, px.
 _FLOW_ERROR: Final = 0.5
 
 #: Depths beyond are not trusted for a position, metres.

@@ -10,7 +10,7 @@ from vestcl.scene import checked
 from vestcl.scene.flow.correspondence import Correspondence, check_size
 from vestcl.scene.flow.parallax import epipolar, moved_pixels, pixel_centres
 
-#: Forward-backward error beyond which flow is not believed, px.
+#: Forward-backward error beyond which flow is rejected, px.
 _FLOW_ERROR: Final = 1.0
 
 #: Flow that is off by more pixels than that, plus a share of the rigid flow, shows object motion. Depth errors of

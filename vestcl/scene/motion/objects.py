@@ -19,7 +19,7 @@ _JUMP: Final = 0.08
 #: Regions of fewer pixels, as a share of the image, are too small to measure and follow only the camera.
 _SMALLEST: Final = 0.0003
 
-#: Forward-backward error beyond which flow is not believed, px.
+#: Forward-backward error beyond which flow is rejected, px.
 _FLOW_ERROR: Final = 1.0
 
 #: Error of flow, px; residuals beyond this many times of it count linearly (Huber).
@@ -32,7 +32,7 @@ _CORRELATED: Final = 50.0
 #: nothing jumps.
 _SPEED_STD: Final = (2.0, 0.1, 2.0)
 
-#: An object counts as moving if that explains its flow so much better: mean robust cost, in variances of flow.
+#: An object counts as moving if that explains its flow better by this: mean robust cost, in variances of flow.
 _GAIN: Final = 1.5
 
 #: Pixels of an object that take part, evenly chosen: neighbours are redundant.
@@ -41,8 +41,8 @@ _PIXELS: Final = 3000
 #: Residual flow beyond this many pixels is a wrong match, not motion, and below this many it is noise.
 _LARGEST, _NOISE = 40.0, 0.2
 
-#: Up to that share of believed flow around a pixel nothing is corrected, from that one on everything: bare asphalt has
-#: little, and would heave.
+#: Up to that share of trusted flow around a pixel nothing is corrected, from that one on everything: bare asphalt has
+#: little, and would move up and down.
 _WEAK, _STRONG = 0.15, 0.35
 
 #: Gauss-Newton rounds.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from vestcl.scene.flow.parallax import pixel_centres
 from vestcl.scene.motion.mask import lies_flat, rigid_pixels
 
-#: Mean squared gradient, (grey levels of 0 to 1 a pixel)^2, at which half of a motion is believed: that of asphalt and
+#: Mean squared gradient, (grey levels of 0 to 1 a pixel)^2, at which half of a motion is trusted: that of asphalt and
 #: of a camera's noise is a tenth of it, that of a facade 20 times as much.
 _HALF: Final = 5e-5
 

@@ -20,7 +20,7 @@ from vestcl.scene.morphology import dilated, eroded
 #: Asked are pixels up to that share of the image's width from a region. Flow of an object is taken from so far inside.
 _BAND, _INSIDE = 0.015, 0.004
 
-#: Forward-backward error beyond which flow is not believed, px.
+#: Forward-backward error beyond which flow is rejected, px.
 _FLOW_ERROR: Final = 1.0
 
 #: Differences of colour are averaged over windows of this many pixels, count up to the first number, and decide from

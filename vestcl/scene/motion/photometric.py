@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 #: Differences of colour beyond that are of something else, and count no more.
 _OTHER: Final = 0.15
 
-#: A motion is believed if it leaves so much of the difference at most ...
+#: A motion is trusted if it leaves so much of the difference at most ...
 _LEFT: Final = 0.9
 
 #: ... and takes that much from it at least: noise of an image.
