@@ -80,7 +80,7 @@ class Where:
     """Folder of prepared clips, in place of ``data``."""
     accumulated_depth: bool = False
     """KITTI raw: depth from `proj_depth/groundtruth`, which has the scans of later frames, too."""
-    driven: street_input.Driven = street_input.USUAL
+    driven: street_input.Driven = street_input.DEFAULT
     """How streets are driven."""
 
     def root(self) -> Path:

@@ -67,7 +67,7 @@ def open(
 
 def _street(seed: int, driven: street_input.Driven, frames: int, height: int | None, width: int | None) -> Clip:
     made, start = street_input.street(seed, driven)
-    fps = float(driven.drawn(seed).fps or street_input.USUAL_RATE)
+    fps = float(driven.drawn(seed).fps or street_input.DEFAULT_RATE)
     size = (height or STREET_SIZE[0], width or STREET_SIZE[1])
     return street_clip(made, frames, *size, start=start, fps=fps)
 

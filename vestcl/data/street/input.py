@@ -25,7 +25,7 @@ RATES: Final = (8.0, 30.0)
 ALL_RATES: Final = (0.1, 240.0)
 
 #: Frames per second without any given.
-USUAL_RATE: Final = 10.0
+DEFAULT_RATE: Final = 10.0
 
 #: With random driving, a street's clip starts somewhere in its first minute, so that all phases of its sway come up.
 STARTS: Final = (0.0, 60.0)
@@ -77,7 +77,7 @@ class Driven:
 
 
 #: Nothing given.
-USUAL: Final = Driven()
+DEFAULT: Final = Driven()
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def parse(text: str) -> StreetInput | None:
     seeds = None if first is None else range(int(first), int(last) + 1)
     if seeds is not None and not seeds:
         raise ValueError(f"`inputs` must have streets from a lower to a higher seed, got {text}")
-    return StreetInput(seeds, USUAL if options is None else _options(text, options), text)
+    return StreetInput(seeds, DEFAULT if options is None else _options(text, options), text)
 
 
 def street(seed: int, driven: Driven) -> tuple[Street, float]:
@@ -145,7 +145,7 @@ def clip(seed: int, driven: Driven, frames: int, size: tuple[int, int], samples:
     """
     driven = driven.drawn(seed)
     made, start = street(seed, driven)
-    fps = USUAL_RATE if driven.fps is None else float(driven.fps)
+    fps = DEFAULT_RATE if driven.fps is None else float(driven.fps)
     plain = street_clip(made, frames, *size, start=start, samples=samples, fps=fps)
     beams = int(np.random.default_rng([seed, _BEAMS]).choice(BEAMS))
     seen = tuple(_seen(sample, index, driven, beams) for index, sample in enumerate(plain))

@@ -9,7 +9,7 @@ from vestcl.forecasting.result import Rendered
 from vestcl.models.config import FORECAST_PLANES
 
 #: Seconds from frame to frame that a clip without timestamps counts as having.
-USUAL_INTERVAL: Final = 0.1
+DEFAULT_INTERVAL: Final = 0.1
 
 #: What a pixel's surface moves is counted up to this share of its distance: beyond, it passes by the camera.
 _MOST_MOVED: Final = 2.0
@@ -25,7 +25,7 @@ def forecast_planes(rendered: Rendered, ahead: int, interval: float | None) -> N
     Args:
         rendered: a frame of a forecast, from any view.
         ahead: k, frame intervals ahead.
-        interval: seconds; None counts as `USUAL_INTERVAL`.
+        interval: seconds; None counts as `DEFAULT_INTERVAL`.
 
     Returns:
         [FORECAST_PLANES, H, W].
@@ -33,7 +33,7 @@ def forecast_planes(rendered: Rendered, ahead: int, interval: float | None) -> N
     inverse = np.divide(1, rendered.depth, out=np.zeros_like(rendered.depth), where=rendered.depth > 0)
     length = np.sqrt(np.square(rendered.motion_xyz).sum(axis=0, keepdims=True))
     moved = np.minimum(ahead * length * inverse, _MOST_MOVED)
-    time = np.full_like(inverse, ahead * (USUAL_INTERVAL if interval is None else interval))
+    time = np.full_like(inverse, ahead * (DEFAULT_INTERVAL if interval is None else interval))
     planes = np.concatenate([rendered.image, rendered.coverage, inverse, moved, time]).astype(np.float32)
     assert len(planes) == FORECAST_PLANES
     return planes
