@@ -71,7 +71,7 @@ def test_a_command_parses(page: str, line: str) -> None:
 
 
 def test_readme_splats() -> None:
-    """The example of README.md, as it stands."""
+    """The example of README.md, as it is."""
     (example,) = (text for text in blocks(README, "python") if "vestcl.splat(" in text)
     names: dict[str, object] = {}
     exec(example, names)

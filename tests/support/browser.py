@@ -85,7 +85,7 @@ class Tab:
         return np.array(self.page.evaluate("window.shown.map((each) => each[0])"), np.float64)
 
     def wait_for(self, width: int, more_than: int = 0) -> None:
-        """Until a image of that width, px, is the last of more than so many that were shown."""
+        """Until an image of that width, px, is the last of more than this many that were shown."""
         shown = f"window.shown.length > {more_than} && window.shown[window.shown.length - 1][1] === {width}"
         self.page.wait_for_function(shown, timeout=60_000)
 

@@ -108,7 +108,7 @@ def run(options: commands.Forecast) -> None:
                 if model is not None:
                     rival = _forecast(clip, index, options, views, stages, inpaint)
                     rivals = compare.compare(rival, clip, index, views, trunk, None, st_lpips, options.score_size)
-                    comparisons = [_beside(*pair, rival.method) for pair in zip(comparisons, rivals, strict=True)]
+                    comparisons = [_with_rival(*pair, rival.method) for pair in zip(comparisons, rivals, strict=True)]
         with stages.stage(forecast_files.WRITING) as report:
             details = _details(options, clip, index, forecast, comparisons, later)
             timed = dataclasses.replace(forecast, seconds=dict(stages.clock.seconds))
@@ -188,7 +188,7 @@ def _forecast(
     return network.forecast_clip(*asked, model, progress=stages.show, **how)
 
 
-def _beside(comparison: Comparison, rival: Comparison, method: str) -> Comparison:
+def _with_rival(comparison: Comparison, rival: Comparison, method: str) -> Comparison:
     """The comparison with another's forecast as an additional method, right after its own."""
     own = compare.FORECAST
     images = {own: comparison.images[own], method: rival.images[own], **comparison.images}

@@ -33,11 +33,11 @@ def source(name: str) -> str:
     parts = [f'#line 1 "{name}"']
     for number, line in enumerate(text.splitlines(), start=1):
         included = re.fullmatch(r'\s*#include "(.+)"\s*', line)
-        parts.append(f'{source(_beside(name, included[1]))}\n#line {number + 1} "{name}"' if included else line)
+        parts.append(f'{source(_sibling(name, included[1]))}\n#line {number + 1} "{name}"' if included else line)
     return "\n".join(parts)
 
 
-def _beside(name: str, included: str) -> str:
+def _sibling(name: str, included: str) -> str:
     near = (PurePosixPath(name).parent / included).as_posix()
     return near if (kernel_folder() / near).is_file() else included
 

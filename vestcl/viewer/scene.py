@@ -180,8 +180,8 @@ def _objects(perception: Perception, index: int) -> NDArray[np.float64]:
     rays = np.tensordot(np.linalg.inv(frame.K), np.stack([u, v, np.ones_like(u)]), 1)
     places, velocities = rays * frame.depth, moving.velocity
     found = []
-    for label in range(1, int(moving.things.max()) + 1):
-        which = moving.things == label
+    for label in range(1, int(moving.instances.max()) + 1):
+        which = moving.instances == label
         if not which.any():
             continue
         velocity = np.median(velocities[:, which], axis=1)

@@ -165,7 +165,7 @@ def show_frame(
 
 
 Cameras = Callable[[float], NDArray[np.float64]]
-"""``future_from_cur`` [4, 4] m after so many intervals."""
+"""``future_from_cur`` [4, 4] m after this many intervals."""
 
 
 def _by_step(cameras: Sequence[NDArray[np.float64]]) -> Cameras:
@@ -174,7 +174,7 @@ def _by_step(cameras: Sequence[NDArray[np.float64]]) -> Cameras:
 
 
 MovingCloud = Callable[[float, Cameras], FrameCloud]
-"""A cloud after so many intervals, given the camera's motion; it is asked for that time and one interval before."""
+"""A cloud after this many intervals, given the camera's motion; it is asked for that time and one interval before."""
 
 
 def frame_clouds(
