@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import yaml
 from forecaster_scenes import TINY
-from train.card.drawn import draw_curves, smoothed, stages_of, write_sheet
+from train.card.images import draw_curves, smoothed, stages_of, write_sheet
 
 from train.card import __main__ as card
-from train.card import drawn as card_images
+from train.card import images as card_images
 from train.card import tables as card_tables
 from train.card.__main__ import Card, main, portable, thinned, write_card
 from train.evaluation.protocols import PROTOCOLS

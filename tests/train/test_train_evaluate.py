@@ -280,7 +280,7 @@ def test_each_model_makes_later_frames_as_it_is_meant_to(tmp_path: Path) -> None
         ({"horizons": (3,)}, "`horizons` must be steps, 1 ... 2"),
         ({"seeds": (5, 4)}, "`seeds` must be from a lower to a higher"),
         ({"shard": "2/2"}, "`shard`"),
-        ({"model": (Path("a/x.safetensors"), Path("b/x.safetensors"))}, "`model` must have files with a stem"),
+        ({"model": (Path("a/x.safetensors"), Path("b/x.safetensors"))}, "`model` must have files with different stems"),
         ({"protocol": "kitti-prediction"}, "`data` must be a folder"),
         ({"first": 9, "last": 3}, "must have 12 frames and a window"),
     ],

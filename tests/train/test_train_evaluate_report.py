@@ -77,7 +77,7 @@ def test_the_camera_is_held_against_constant_velocity() -> None:
     camera = [record(CONSTANT_VELOCITY, c, [4.0, 4.0, 8.0], CAMERA, "translation_percent") for c in "ab"]
     camera += [record("ours", c, [3.0, 3.0, 9.0], CAMERA, "translation_percent") for c in "ab"]
     found = find(short_grids(results(*camera)), f"view {CAMERA}, model less {CONSTANT_VELOCITY}")
-    assert found.rows == (("ours, path", "-1.00 [-1.00, -1.00], 100%", "+1.00 [+1.00, +1.00], 0%"),)
+    assert found.rows == (("ours, translation", "-1.00 [-1.00, -1.00], 100%", "+1.00 [+1.00, +1.00], 0%"),)
 
 
 def test_one_clip_is_marked_as_doubtful() -> None:
