@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import yaml
 from forecaster_scenes import TINY
-from train.card.images import draw_curves, smoothed, stages_of, write_sheet
 
 from train.card import __main__ as card
 from train.card import images as card_images
 from train.card import tables as card_tables
 from train.card.__main__ import Card, main, portable, thinned, write_card
+from train.card.images import draw_curves, smoothed, stages_of, write_sheet
 from train.evaluation.protocols import PROTOCOLS
 from train.evaluation.report import EvaluationResults, as_json
 from train.evaluation.windows import CAMERA, CONSTANT_VELOCITY
