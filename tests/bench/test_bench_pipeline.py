@@ -12,17 +12,14 @@ from forecaster_scenes import OBJECTS, SMALL, stir
 from PIL import Image
 
 from vestcl.bench.common import results as _results
-from vestcl.bench.common.timing import Spread
 from vestcl.bench.pipeline import traffic as _traffic
-from vestcl.bench.pipeline.bench import PipelineBench, load, main, verdicts, word
+from vestcl.bench.pipeline.bench import PipelineBench, load, main, verdicts
 from vestcl.bench.pipeline.measure import ALL, NONE, PEER, SWITCHES, TWICE, Stepper, variants
 from vestcl.bench.pipeline.traffic import EMPTY, EVERYTHING, JAM, STREETS, TRAFFIC, drive
 from vestcl.models.config import EncoderConfig
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.options import InferenceOptions
 from vestcl.models.inference.stage_times import REST, STAGES
-from vestcl.models.steps import render as _render
-from vestcl.ops.splat import rasterize
 
 HEIGHT, WIDTH = 32, 96
 
@@ -108,15 +105,6 @@ def test_what_is_skipped_is_counted_and_changes_nothing(drives: dict[str, _traff
                 assert all(counts[switch].skipped == counts[switch].of > 0 for switch in ("background", "objects"))
 
 
-def test_what_the_splatter_leaves_out(drives: dict[str, _traffic.Drive]) -> None:
-    with torch.no_grad():
-        counts = Stepper(model(), variants(InferenceOptions())[0], drives[EVERYTHING]).splatter()
-    assert vars(_render)["rasterize"] is rasterize
-    points = counts["points without fragments"]
-    assert 0 < points.skipped < points.of and 2 * HEIGHT * WIDTH < points.of <= 3 * HEIGHT * WIDTH
-    assert counts["empty tiles"].of > 0 and counts["saturated pixels"].of == 2 * HEIGHT * WIDTH
-
-
 def test_a_run_writes_and_prints_everything(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,18 +128,19 @@ def test_a_run_writes_and_prints_everything(
     )
     (result,), printed = _results.load(tmp_path / "new folder" / "pipeline.json"), capsys.readouterr().out
     assert result.bench == "pipeline" and result.config["quality"] == "exact"
-    names = {measure.name: measure for measure in result.measures}
+    figures = result.figures.set_index("name")
     for scene in (EMPTY, EVERYTHING):
         for variant in (NONE, ALL, "seen alone", PEER, "copy", "inpaint"):
-            assert names[f"{scene}: {variant}"].median > 0 and names[f"{scene}: {variant}"].unit == "s"
+            assert figures["median"][f"{scene}: {variant}"] > 0 and figures["unit"][f"{scene}: {variant}"] == "s"
         for stage in (*STAGES.values(), REST):
-            assert names[f"{scene}: {NONE}: {stage}"].median >= 0
-        found = result.details["scenes"][scene]
-        whole = names[f"{scene}: {NONE}"]
-        assert found["seconds"][NONE]["runs"] == whole_runs(found) >= 2 and whole.low <= whole.median <= whole.high
-    assert names[f"{EMPTY}: lost"].unit == "dB" and f"{EVERYTHING}: lost" not in names
-    assert result.details["counts"][EMPTY]["objects"]["skipped"] == result.details["counts"][EMPTY]["objects"]["of"]
-    assert len(result.details["targets"]) == 4
+            assert figures["median"][f"{scene}: {NONE}: {stage}"] >= 0
+        whole = figures.loc[f"{scene}: {NONE}"]
+        assert whole["runs"] == figures["runs"][f"{scene}: {NONE}: refine"] >= 2
+        assert whole["low"] <= whole["median"] <= whole["high"]
+    assert figures["unit"][f"{EMPTY}: lost"] == "dB" and f"{EVERYTHING}: lost" not in figures.index
+    skipped = result.frame[(result.frame["column"] == "skipped") & (result.frame["row"] == "objects alone")]
+    assert skipped["text"].iloc[0].startswith("100% of")
+    assert result.frame["column"].str.startswith("target ").sum() == 4
     (plot,) = (tmp_path / "plots").iterdir()
     with Image.open(plot) as picture:
         assert picture.width > 1000 and len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
@@ -161,14 +150,9 @@ def test_a_run_writes_and_prints_everything(
         "forecast step, empty road (0% foreground)",
         "views alone",
         "targets",
-        "skipping saves",
-        "empty tiles",
+        "against nothing",
     ):
         assert text in printed and text in (tmp_path / "pipeline.md").read_text(encoding="utf-8")
-
-
-def whole_runs(found: dict[str, Any]) -> int:
-    return int(found["stages"][NONE]["refine"]["runs"])
 
 
 @pytest.mark.parametrize(
@@ -184,15 +168,8 @@ def whole_runs(found: dict[str, Any]) -> int:
     ],
 )
 def test_verdicts(name: str, of_peer: float, saved: float, loss: float | None, cores: float, words: list[str]) -> None:
-    def always(value: float) -> Spread:
-        return Spread(value, value, value, 1)
-
-    pictures = {"truth_nothing": None, "truth_all": None}
-    if loss is not None:
-        pictures = {"truth_nothing": 30 + loss, "truth_all": 30.0}
-    scene = {"name": name, "saved_share": {ALL: always(saved)}, "of_peer": always(of_peer), "pictures": pictures}
-    targets = verdicts(scene | {"others_cores": cores})
-    assert [word(target) for target in targets] == words
+    found = verdicts(name, of_peer, saved, loss, cores)
+    assert [text.split(" ", 2)[2] for text in found.values()] == words
 
 
 def test_load_takes_quality_and_precision(tmp_path: Path) -> None:

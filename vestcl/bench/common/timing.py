@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -117,29 +117,12 @@ def peak_gigabytes() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * units / 1e9
 
 
-def copies_of_forward(features: torch.Tensor, threads: int) -> dict[str, Task]:
-    """Features in, image out: ways to copy the features to memory that is there already, by name."""
-    to = torch.empty_like(features)
-    pairs, pool = _shares(threads, to, features), ThreadPoolExecutor(threads)
-    return {
-        "torch copy_": lambda: to.copy_(features),
-        "numpy copyto": lambda: list(pool.map(lambda pair: np.copyto(*pair), pairs)),
-    }
-
-
-def copies_of_backward(features: torch.Tensor, threads: int) -> dict[str, Task]:
-    """Features and the image's gradient in, the features' gradient out: ways to add two arrays into a third."""
-    grad, to = torch.ones_like(features), torch.empty_like(features)
-    triples, pool = _shares(threads, features, grad, to), ThreadPoolExecutor(threads)
-    return {
-        "torch add": lambda: torch.add(features, grad, out=to),
-        "numpy add": lambda: list(pool.map(lambda abc: np.add(abc[0], abc[1], out=abc[2]), triples)),
-    }
-
-
-def _shares(threads: int, *tensors: torch.Tensor) -> list[tuple[NDArray[Any], ...]]:
-    """The tensors' memory, one equal share a thread."""
-    return list(zip(*(np.array_split(tensor.numpy().reshape(-1), threads) for tensor in tensors), strict=True))
+def memcpy(threads: int, *sources: torch.Tensor) -> Task:
+    """Copy one array, or add two, into memory that is there already, a share a thread: what moving the bytes takes."""
+    to, pool = torch.empty_like(sources[0]), ThreadPoolExecutor(threads)
+    shares = zip(*(np.array_split(of.numpy().reshape(-1), threads) for of in (to, *sources)), strict=True)
+    pairs, operation = list(shares), np.positive if len(sources) == 1 else np.add
+    return lambda: list(pool.map(lambda pair: operation(*pair[1:], out=pair[0]), pairs))  # type: ignore[call-overload]
 
 
 @dataclass
