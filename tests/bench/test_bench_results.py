@@ -18,8 +18,9 @@ from vestcl import doctor, opencl
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import table as _table
+from vestcl.bench.common.options import Options
 from vestcl.bench.common.results import Results
-from vestcl.bench.common.timing import Spread
+from vestcl.bench.common.timing import Spread, busy_cores
 from vestcl.evaluation.tables import Grid
 
 
@@ -87,7 +88,7 @@ def test_nothing_is_written_where_no_file_is_asked_for(tmp_path: Path, monkeypat
 
 @pytest.mark.parametrize(
     ("saved", "message"),
-    [([], "got none"), ([results(), results("lute")], "got abacus, lute"), ([results(x=object())], "got object")],
+    [([results(x=object())], "got object")],
 )
 def test_what_can_not_be_saved_leaves_the_old_file(tmp_path: Path, saved: list[Results], message: str) -> None:
     path = tmp_path / "r.json"
@@ -283,9 +284,20 @@ def test_file_names() -> None:
 
 
 def test_verdicts_are_coloured_and_text_is_no_markup(console: Console) -> None:
-    grid = Grid("[b]title", ("", "target"), (("[red]a", "<= 6 reached"), ("b", "missed it")), _table.busy(1e6))
+    grid = Grid("[b]title", ("", "target"), (("[red]a", "<= 6 reached"), ("b", "missed it")), ("busy: measure again",))
     _table.show_grid(grid, console)
     plain, styled = console.export_text(clear=False), console.export_text(styles=True)
     assert "[b]title" in plain and "[red]a" in plain and "measure again" in " ".join(plain.split())
     assert "\x1b[32mreached" in styled and "\x1b[31mmissed" not in styled
-    assert _table.busy(0.0, None) == ()
+
+
+def test_a_disturbed_section_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    def sections(*_: Any) -> Iterator[_table.Section]:
+        for cores in (0.0, 9.0, 0.0):
+            busy_cores.set(cores)
+            yield _table.Section(f"table {cores}", [_table.Measurement("a", "b", "c")])
+
+    _results.run("abacus", Options(), sections)
+    quiet, disturbed, again = capsys.readouterr().out.split("\ntable ")[1:]
+    assert "kept 9.0 cores busy meanwhile: measure again" in " ".join(disturbed.split())
+    assert "busy" not in quiet and "busy" not in again

@@ -84,13 +84,16 @@ def pairs(before: Sequence[Results], after: Sequence[Results]) -> list[tuple[Res
     benches = list(dict.fromkeys(result.bench for result in (*before, *after)))
     if len(benches) != 1:
         raise ValueError(f"`before` and `after` must be of the same benchmark, got {' and '.join(benches) or 'none'}")
-    if len(before) == len(after) == 1:
-        return [(before[0], after[0])]
-    found = [(one, two) for one in before for two in after if one.machine.get("device") == two.machine.get("device")]
+    alike = len(before) == len(after) == 1
+    found = [(one, two) for one in before for two in after if alike or _device(one) == _device(two)]
     if not found:
-        devices = (", ".join(str(result.machine.get("device")) for result in run) for run in (before, after))
+        devices = (", ".join(map(_device, run)) for run in (before, after))
         raise ValueError(f"`before` and `after` must have a device in common, got {' and '.join(devices)}")
     return found
+
+
+def _device(result: Results) -> str:
+    return result.machine.get("device", "unknown device")
 
 
 def warnings(before: Results, after: Results) -> Iterator[str]:
@@ -141,7 +144,7 @@ def _grid(before: Results, after: Results, changes: pd.DataFrame) -> Grid:
         ranges = (_range(change, when) for when in ("before", "after"))
         unit = _UNITS.get(change["unit"], change["unit"])
         rows.append((change["name"], change["verdict"], f"{change['percent']:+.1f}", unit, *ranges))
-    names = (result.machine.get("device", "unknown device") for result in (before, after))
+    names = map(_device, (before, after))
     dates = " -> ".join(result.machine.get("date", "?") for result in (before, after))
     title = f"vestcl bench {after.bench}, {' -> '.join(dict.fromkeys(names))}, {dates}"
     notes = (

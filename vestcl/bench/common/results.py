@@ -8,7 +8,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -22,8 +22,8 @@ from vestcl import doctor, opencl
 from vestcl._version import __version__
 from vestcl.bench.common import plots
 from vestcl.bench.common.options import Options
-from vestcl.bench.common.table import Better, Section, show_grid
-from vestcl.bench.common.timing import torch_threads
+from vestcl.bench.common.table import AGAIN, Better, Section, show_grid
+from vestcl.bench.common.timing import busy_cores, is_quiet, torch_threads
 from vestcl.evaluation.tables import Grid, finite, to_markdown
 from vestcl.io import atomic
 from vestcl.opencl import trace
@@ -101,7 +101,12 @@ def run(bench: str, config: Options, measure: Callable[[opencl.Session, Console]
         for name, value in machine.items():
             screen.print(f"{name}: {value}", soft_wrap=True, highlight=False, markup=False)
         frames, grids, number = list[pd.DataFrame](), list[Grid](), f"{len(results)} " if results else ""
+        busy_cores.set(0.0)
         for section in measure(session, screen):
+            if not is_quiet():
+                note = f"other processes kept {busy_cores.get():.1f} cores busy meanwhile: {AGAIN}"
+                section = replace(section, notes=(*section.notes, note))
+            busy_cores.set(0.0)
             frames.append(section.frame)
             grids.append(section.grid())
             show_grid(grids[-1], screen)
@@ -118,9 +123,6 @@ def run(bench: str, config: Options, measure: Callable[[opencl.Session, Console]
     return found
 
 
-# ---------------------------------------------------------------- devices
-
-
 def measure_each(selector: str | None, measure: Callable[[opencl.Session], Results], console: Console) -> list[Results]:
     """``measure`` the device that ``selector`` means as in `opencl.select`, which is vestcl's current one meanwhile.
 
@@ -130,34 +132,30 @@ def measure_each(selector: str | None, measure: Callable[[opencl.Session], Resul
     Raises:
         DeviceError: no such device, or with "all" none that works.
     """
+    if selector != ALL:
+        with opencl.use(selector) as session:
+            return [measure(session)]
     results = []
-    for index in _usable(console) if selector == ALL else [selector]:
-        with opencl.use(index) as session:
+    with console.status("trying every OpenCL device"):
+        devices = doctor.examine().devices
+    if not any(device.works for device in devices):
+        raise opencl.DeviceError("no OpenCL device works: `vestcl doctor` tells why")
+    for device in devices:
+        reason = next(iter(device.notes), "does not work")
+        if device.works:
             try:
-                results.append(measure(session))
+                with opencl.use(device.info.index) as session:
+                    results.append(measure(session))
+                continue
             except Exception as error:  # drivers fail in many ways, and only runtime knows pyopencl's
-                if isinstance(error, ValueError) or selector != ALL:  # a mistake in the settings is no device's
+                if isinstance(error, ValueError):  # a mistake in the settings is no device's
                     raise
-                _report(console, session.info, f"{type(error).__name__}: {error}")
+                reason = f"{type(error).__name__}: {error}"
+        about = f"{device.info.index} {device.info.platform} / {device.info.name} left out: {reason}"
+        console.print(Text(about, "red"), soft_wrap=True)
     if not results:
         raise opencl.DeviceError("the benchmark failed on every device")
     return results
-
-
-def _usable(console: Console) -> list[str]:
-    with console.status("trying every OpenCL device"):
-        report = doctor.examine()
-    for device in report.devices:
-        if not device.works:
-            _report(console, device.info, next(iter(device.notes), "does not work"))
-    works = [device.info.index for device in report.devices if device.works]
-    if not works:
-        raise opencl.DeviceError("no OpenCL device works: `vestcl doctor` tells why")
-    return works
-
-
-def _report(console: Console, info: opencl.DeviceInfo, reason: str) -> None:
-    console.print(Text(f"{info.index} {info.platform} / {info.name} left out: {reason}", "red"), soft_wrap=True)
 
 
 def console(width: int | None = None) -> Console:
@@ -205,24 +203,17 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-# ---------------------------------------------------------------- screen and files
-
-
 def save(results: Sequence[Results], json: Path | None, markdown: Path | None) -> None:
     """Write the results, each file whole or not at all.
 
     Args:
-        results: of one benchmark, a device each.
+        results: of one benchmark, a device each, one or more.
         json: file {"vestcl": 1, "bench": ..., "devices": [{"machine", "config", "measures": [a row each]}]}, or None.
         markdown: file with machine and tables of each device, or None.
 
     Raises:
-        ValueError: nothing to save, results of several benchmarks, a value that `plain` refuses, a folder that can't be
-            made.
+        ValueError: a value that `plain` refuses, a folder that can't be made.
     """
-    benches = {result.bench for result in results}
-    if len(benches) != 1:
-        raise ValueError(f"`results` must be of one bench, got {', '.join(sorted(benches)) or 'none'}")
     if json is not None:
         devices = [
             {"machine": one.machine, "config": one.config, "measures": one.frame.to_dict("records")} for one in results

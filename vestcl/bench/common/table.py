@@ -34,7 +34,8 @@ SHOWN: Final = {"s": 1e3, "B": 1e-6}
 #: What a cell may end with, and its colour on the screen.
 _VERDICTS: Final = {"reached": "green", "missed": "red", "can't tell": "yellow", "better": "green", "worse": "red"}
 
-_AGAIN: Final = "measure again"
+#: End of a note where other processes disturbed what a table shows.
+AGAIN: Final = "measure again"
 
 #: Columns of the screen around a cell.
 _AROUND: Final = 2
@@ -119,17 +120,9 @@ class Section:
         return Grid(self.title, ("", *map(str, wide.columns)), rows, self.notes)
 
 
-def busy(*others_cores: float | None) -> tuple[str, ...]:
-    """A note where other processes disturbed what a table shows."""
-    busiest = max((cores or 0.0 for cores in others_cores), default=0.0)
-    if is_quiet(busiest):
-        return ()
-    return (f"other processes kept {busiest:.1f} cores busy meanwhile: {_AGAIN}",)
-
-
-def verdict(reached: bool, others_cores: float | None = None) -> str:
-    """What became of a target; a busy machine proves no target missed."""
-    return "reached" if reached else "missed" if is_quiet(others_cores) else "can't tell"
+def verdict(reached: bool, timed: bool = True) -> str:
+    """What became of a target; a busy machine proves no target of times missed."""
+    return "reached" if reached else "missed" if not timed or is_quiet() else "can't tell"
 
 
 def show_grid(grid: Grid, console: Console) -> None:
@@ -143,7 +136,7 @@ def show_grid(grid: Grid, console: Console) -> None:
             table.add_row(*map(_coloured, row))
         console.print(table)
     for note in grid.notes:
-        console.print(Text(f"  {note}", "red" if note.endswith(_AGAIN) else "dim"))
+        console.print(Text(f"  {note}", "red" if note.endswith(AGAIN) else "dim"))
     console.print()
 
 

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -31,6 +32,9 @@ PAUSE: Final = 0.01
 
 #: The share of the machine that other processes may keep busy before no target counts as reached or missed.
 QUIET_SHARE: Final = 0.05
+
+#: Cores that other processes kept busy during measurements, the most since it was set to 0.
+busy_cores: Final = ContextVar("busy_cores", default=0.0)
 
 
 @dataclass(frozen=True)
@@ -72,16 +76,17 @@ def interleave(tasks: Mapping[str, Task], seconds: float, least: int = LEAST_ROU
     gc.collect()
     gc.disable()
     try:
-        for number in range(MOST_ROUNDS):
-            if number >= least and time.perf_counter() > end:
-                break
-            shuffle(order)
-            for name, task in order:
-                time.sleep(PAUSE)
-                start = time.perf_counter()
-                result = task()
-                times[name].append(time.perf_counter() - start)
-                del result
+        with watching_others():
+            for number in range(MOST_ROUNDS):
+                if number >= least and time.perf_counter() > end:
+                    break
+                shuffle(order)
+                for name, task in order:
+                    time.sleep(PAUSE)
+                    start = time.perf_counter()
+                    result = task()
+                    times[name].append(time.perf_counter() - start)
+                    del result
     finally:
         if collects:
             gc.enable()
@@ -125,28 +130,19 @@ def memcpy(threads: int, *sources: torch.Tensor) -> Task:
     return lambda: list(pool.map(lambda pair: operation(*pair[1:], out=pair[0]), pairs))  # type: ignore[call-overload]
 
 
-@dataclass
-class Others:
-    """What `watching_others` saw."""
-
-    cores: float | None = None
-    """Cores that other processes kept busy; None where /proc does not say."""
-
-
 @contextlib.contextmanager
-def watching_others() -> Iterator[Others]:
-    """Measure, until the ``with`` block ends, how busy other processes keep the machine."""
-    others = Others()
+def watching_others() -> Iterator[None]:
+    """Measure, until the ``with`` block ends, how many cores other processes keep busy, for `busy_cores`."""
     start, before = time.perf_counter(), _others_seconds()
-    yield others
+    yield
     after, seconds = _others_seconds(), time.perf_counter() - start
     if before is not None and after is not None:
-        others.cores = max(0.0, (after - before) / seconds)
+        busy_cores.set(max(busy_cores.get(), (after - before) / seconds))
 
 
-def is_quiet(others_cores: float | None) -> bool:
+def is_quiet() -> bool:
     """Whether so busy a machine still gives honest ratios: threads that wait for each other suffer more than others."""
-    return others_cores is None or others_cores <= QUIET_SHARE * (os.cpu_count() or 1)
+    return busy_cores.get() <= QUIET_SHARE * (os.cpu_count() or 1)
 
 
 def _others_seconds() -> float | None:

@@ -14,7 +14,7 @@ from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.options import Options
-from vestcl.bench.common.table import Measurement, Section, busy, verdict
+from vestcl.bench.common.table import Measurement, Section, verdict
 from vestcl.bench.common.timing import Spread
 from vestcl.bench.network.train_step import ADAM, BACKWARD, FORWARD, OPENCL, Trainer, batch_of, made
 from vestcl.bench.pipeline.traffic import LEAST_FRAMES, TRAFFIC, Window, drive
@@ -74,12 +74,12 @@ def _sections(config: NetworkBench, model_config: ModelConfig, _: opencl.Session
     model = made(model_config, config.seed)
     model.options = dataclasses.replace(model.options, seen=False)  # the frames are the same ones in all runs
     window = drive(TRAFFIC, config.height, config.width, LEAST_FRAMES, config.seed).windows[0]
-    with _timing.watching_others() as others:
+    with _timing.watching_others():
         runs = [forecast(model.eval(), window) for _run in range(1 + config.runs)]
-    yield section(config, "forecast", Spread.of_each(runs[1:]), others.cores)
+    yield section(config, "forecast", Spread.of_each(runs[1:]))
     if config.training:
         trainer = Trainer(model.train(), (), batch_of(config, config.height, config.width, config.batch))
-        with _timing.watching_others() as others:
+        with _timing.watching_others():
             for _run in range(1 + config.runs):
                 trainer.step()
         seconds = [
@@ -92,7 +92,7 @@ def _sections(config: NetworkBench, model_config: ModelConfig, _: opencl.Session
             }
             for run in trainer.runs[1:]
         ]
-        yield section(config, f"training, batch {config.batch}", Spread.of_each(seconds), others.cores)
+        yield section(config, f"training, batch {config.batch}", Spread.of_each(seconds))
 
 
 def forecast(model: Forecaster, window: Window) -> dict[str, float]:
@@ -108,7 +108,7 @@ def forecast(model: Forecaster, window: Window) -> dict[str, float]:
     return dict(watch.seconds)
 
 
-def section(config: NetworkBench, title: str, seconds: Mapping[str, Spread], others_cores: float | None) -> Section:
+def section(config: NetworkBench, title: str, seconds: Mapping[str, Spread]) -> Section:
     """Stages with their targets; memory is the most that was taken so far."""
     targets, rows = TARGETS.get((config.model, config.height, config.width), {}), list[Measurement]()
     for key, spread in seconds.items():
@@ -117,12 +117,12 @@ def section(config: NetworkBench, title: str, seconds: Mapping[str, Spread], oth
             continue
         rows.append(Measurement(name, "ms (quartiles)", spread, "s", name=f"{title}: {name}"))
         if key in targets:
-            word = verdict(spread.median <= targets[key], others_cores)
+            word = verdict(spread.median <= targets[key])
             rows.append(Measurement(name, "target", f"<= {targets[key] * 1e3:.0f} {word}"))
     memory = _timing.peak_gigabytes()
     rows.append(Measurement("peak memory, GB", "ms (quartiles)", memory, "GB", ".2f", f"{title}: peak memory"))
     if "memory" in targets:
-        word = verdict(memory <= targets["memory"])
+        word = verdict(memory <= targets["memory"], timed=False)
         rows.append(Measurement("peak memory, GB", "target", f"<= {targets['memory']:g} {word}"))
     size = f"{config.height}x{config.width}, {config.threads} threads"
-    return Section(f"{config.model}, {title}, {size}", rows, busy(others_cores))
+    return Section(f"{config.model}, {title}, {size}", rows)

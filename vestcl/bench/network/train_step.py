@@ -15,7 +15,7 @@ from vestcl import opencl
 from vestcl.bench.common import results, timing
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.plots import bars
-from vestcl.bench.common.table import Measurement, Section, busy
+from vestcl.bench.common.table import Measurement, Section
 from vestcl.bench.common.timing import Spread
 from vestcl.bench.pipeline.bench import SEED
 from vestcl.bench.pipeline.traffic import LEAST_FRAMES, TRAFFIC, Window, drive
@@ -90,7 +90,7 @@ def _sections(
     """Variants and their stages, on one device; times are seconds a step, in turns."""
     model, batch = made(model_config, config.seed).train(), batch_of(config, config.height, config.width, config.batch)
     trainers = {name: Trainer(model, frozen, batch) for name, frozen in FROZEN.items()}
-    with console.status("training steps"), timing.recycling_allocator(), timing.watching_others() as others:
+    with console.status("training steps"), timing.recycling_allocator():
         times = timing.interleave({name: trainer.step for name, trainer in trainers.items()}, config.seconds)
     rows, stages = list[Measurement](), list[Measurement]()
     for name, trainer in trainers.items():
@@ -107,8 +107,8 @@ def _sections(
         for stage, spread in Spread.of_each([run["stages"] for run in runs]).items():
             stages.append(Measurement(stage, name, spread, "s", ".1f", f"{name}: {FORWARD}: {stage}"))
     size = f"{config.model}, {config.height}x{config.width}, batch {config.batch}"
-    notes = f"{whole.runs} rounds. OpenCL's share of a step is a part of {FORWARD} and {BACKWARD}.", *busy(others.cores)
-    yield Section(f"training step, {size}", rows, notes)
+    note = f"{whole.runs} rounds. OpenCL's share of a step is a part of {FORWARD} and {BACKWARD}."
+    yield Section(f"training step, {size}", rows, (note,))
     yield Section("stages of forward, ms", stages, ("Medians.",), {"train step": partial(bars, stacked=True)})
 
 

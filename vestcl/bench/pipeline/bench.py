@@ -12,14 +12,13 @@ from vestcl.bench.common import results as _results
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.plots import bars
 from vestcl.bench.common.results import X_COPY
-from vestcl.bench.common.table import Measurement, Section, busy, verdict
+from vestcl.bench.common.table import Measurement, Section, verdict
 from vestcl.bench.common.timing import Spread
-from vestcl.bench.pipeline.measure import ALL, COPY, INPAINT, NONE, PEER, Measured, measure_scene, variants
+from vestcl.bench.pipeline.measure import ALL, COPY, INPAINT, NONE, PEER, Measured, measure_scene
 from vestcl.bench.pipeline.traffic import EMPTY, EVERYTHING, JAM, LEAST_FRAMES, TRAFFIC, drive
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import quality
 from vestcl.models.inference.fast import accelerate
-from vestcl.models.inference.options import EXACT
 from vestcl.models.inference.skipping import Count
 from vestcl.models.networks import voxel_flow
 from vestcl.opencl import trace
@@ -103,7 +102,7 @@ def _check(config: PipelineBench) -> None:
 
 def _sections(config: PipelineBench, model: Forecaster, _: opencl.Session, console: Console) -> Iterator[Section]:
     """All scenes on one device, as they come, and tables of all of them."""
-    scenes, stages = list[Measured](), list[Measurement]()
+    targets, stages = list[Measurement](), list[Measurement]()
     for name in dict.fromkeys(config.scenes):
         with console.status(name), trace.stage(name):
             scene = drive(name, config.height, config.width, config.frames, config.seed)
@@ -113,25 +112,22 @@ def _sections(config: PipelineBench, model: Forecaster, _: opencl.Session, conso
         notes = (
             f"{INPAINT}: a new frame's background, before the step. {COPY}: of both frames' layers.",
             f"{len(one.times[NONE])} rounds.",
-            *busy(one.others_cores),
         )
+        targets += _target_rows(one)
         yield Section(title, list(_scene_rows(one)), notes)
         stages += _stage_rows(one)
-        scenes.append(one)
     plot = partial(bars, stacked=True)
     yield Section("stages with nothing and with all skipped, ms", stages, ("Medians.",), {"pipeline": plot})
-    rows = [row for one in scenes for row in _target_rows(one)]
-    yield Section("targets", rows, ("PSNR: means over the drives' steps; inf: the same.",))
+    yield Section("targets", targets, ("PSNR: means over the drives' steps; inf: the same.",))
 
 
 def _scene_rows(scene: Measured) -> Iterator[Measurement]:
-    """A variant each: its time, what that saves of its base's in the same round, and what is skipped."""
-    bases = {variant.name: variant.base for variant in variants(EXACT) if variant.base}
+    """A variant each: its time, what that saves in the same round, and what is skipped."""
     for name, times in scene.times.items():
         figure = f"{scene.name}: {name}"
         yield Measurement(name, "ms (quartiles)", Spread.of(times), "s", name=figure)
-        if name in bases:
-            share = Spread.of(1 - times / scene.times[bases[name]])
+        if name in scene.stages and name != NONE:
+            share = Spread.of(1 - times / scene.times[NONE])
             yield Measurement(name, "saved", share, "1", "+.1%", f"{figure}: saved", "higher")
         if name in scene.counts:
             yield Measurement(name, "skipped", counted(scene.counts[name]))
@@ -163,24 +159,22 @@ def _target_rows(scene: Measured) -> Iterator[Measurement]:
     if loss is not None:
         yield Measurement(name, "PSNR drop", loss, "dB", ".2f", f"{name}: lost")
     ratio = None if of_peer is None else of_peer.median
-    for what, text in verdicts(name, ratio, saved.median, loss, scene.others_cores).items():
+    for what, text in verdicts(name, ratio, saved.median, loss).items():
         yield Measurement(name, what, text)
 
 
-def verdicts(
-    name: str, of_peer: float | None, saved: float, loss: float | None, others_cores: float | None
-) -> dict[str, str]:
+def verdicts(name: str, of_peer: float | None, saved: float, loss: float | None) -> dict[str, str]:
     """Every target that a scene has figures for: what, and "<= 0.5 reached"."""
     found = {}
     if name in OF_PEER and of_peer is not None:
         most = OF_PEER[name]
-        found[f"target of {PEER}'s"] = f"<= {most:g} {verdict(of_peer <= most, others_cores)}"
+        found[f"target of {PEER}'s"] = f"<= {most:g} {verdict(of_peer <= most)}"
     if name in SAVED:
-        found["target saved"] = f">= {SAVED[name]:.0%} {verdict(saved >= SAVED[name], others_cores)}"
+        found["target saved"] = f">= {SAVED[name]:.0%} {verdict(saved >= SAVED[name])}"
     if name == EVERYTHING:
-        found["target saved"] = f">= {-MOST_COST:.0%} {verdict(-saved <= MOST_COST, others_cores)}"
+        found["target saved"] = f">= {-MOST_COST:.0%} {verdict(-saved <= MOST_COST)}"
     if loss is not None:
-        found["target drop"] = f"<= {MOST_LOSS:g} {verdict(loss <= MOST_LOSS)}"
+        found["target drop"] = f"<= {MOST_LOSS:g} {verdict(loss <= MOST_LOSS, timed=False)}"
     return found
 
 

@@ -29,47 +29,24 @@ PEER, COPY, INPAINT = "DMVFN", "copy", "inpaint"
 
 NONE, ALL = "nothing skipped", "all skipped"
 
-#: Nothing skipped, where a camera is asked for twice: what "views" is compared with.
-TWICE: Final = "nothing skipped, the view twice"
-
 #: Of `InferenceOptions`, in the order of a forecast.
-SWITCHES: Final = ("seen", "background", "objects", "covered", "views")
+SWITCHES: Final = ("seen", "background", "objects", "covered")
 
 
-@dataclass(frozen=True)
-class Variant:
-    """A way to make the same forecast."""
-
-    name: str
-    options: InferenceOptions
-    base: str | None = None
-    """The variant that it is compared with."""
-    switch: str | None = None
-    """The one that is on, where it is only one."""
-
-    @property
-    def twice(self) -> bool:
-        """Whether the view is asked for twice."""
-        return TWICE in (self.name, self.base)
-
-
-def variants(options: InferenceOptions) -> list[Variant]:
-    """Nothing skipped, each switch by itself, and all that ``options`` has on."""
+def variants(options: InferenceOptions) -> dict[str, InferenceOptions]:
+    """By name: nothing skipped, each of SWITCHES by itself, and all that ``options`` have on."""
     nothing = options.without_skips()
-    found = [Variant(NONE, nothing), Variant(TWICE, nothing)]
-    for switch in SWITCHES:
-        one = dataclasses.replace(nothing, **{switch: True})  # type: ignore[arg-type]
-        found.append(Variant(f"{switch} alone", one, TWICE if switch == "views" else NONE, switch))
-    return [*found, Variant(ALL, options, NONE)]
+    alone = {f"{name} alone": dataclasses.replace(nothing, **{name: True}) for name in SWITCHES}  # type: ignore[arg-type]
+    return {NONE: nothing, **alone, ALL: options}
 
 
 class Stepper:
     """One variant's forecast steps, window after window, round and round."""
 
-    def __init__(self, model: Forecaster, variant: Variant, drive: Drive) -> None:
-        self.variant, self._drive = variant, drive
+    def __init__(self, model: Forecaster, name: str, options: InferenceOptions, drive: Drive) -> None:
+        self._name, self._drive = name, drive
         self._model = copy.deepcopy(model)  # each variant remembers its own frames
-        self._model.options = variant.options
+        self._model.options = options
         self._windows = itertools.cycle(enumerate(drive.windows))
         self.stages: list[dict[str, float]] = []
         self.places: list[int] = []
@@ -83,9 +60,9 @@ class Stepper:
     def _forecast(self, window: Window) -> torch.Tensor:
         given = window.given
         prior = given.prior if self._model.config.start == "prior" else None
-        views = [(window.tgt_from_next, given.K)] * (2 if self.variant.twice else 1)
+        views = [(window.tgt_from_next, given.K)]
         start = time.perf_counter()
-        with trace.stage(self.variant.name), watching() as watch:
+        with trace.stage(self._name), watching() as watch:
             done = self._model.forecast(*window.frames, given.K, 1, views, prior=prior, own=given.own)
         self.stages.append(with_rest(watch.seconds, time.perf_counter() - start))
         return done[0].views[0].image
@@ -117,7 +94,6 @@ class Measured:
     """Mean PSNR over the drive of all skipped against nothing skipped, dB."""
     truth: tuple[float, float] | None
     """The same of nothing skipped and of all skipped against the truth, if that is known."""
-    others_cores: float | None
 
 
 def measure_scene(model: Forecaster, drive: Drive, seconds: float, threads: int, peer: bool) -> Measured:
@@ -130,12 +106,13 @@ def measure_scene(model: Forecaster, drive: Drive, seconds: float, threads: int,
         threads: of the copy; torch's are as they are.
         peer: whether DMVFN runs, too.
     """
-    steppers = {variant.name: Stepper(model, variant, drive) for variant in variants(model.options)}
+    every = variants(model.options)
+    steppers = {name: Stepper(model, name, options, drive) for name, options in every.items()}
     tasks: dict[str, Task] = {name: stepper.step for name, stepper in steppers.items()}
     planes = torch.cat([plane for frame in drive.windows[0].frames for plane in frame], dim=1)
     tasks |= {COPY: _timing.memcpy(threads, planes), INPAINT: _inpaint(drive)}
     tasks |= {PEER: _peer(drive)} if peer else {}
-    with torch.inference_mode(), _timing.recycling_allocator(), _timing.watching_others() as others:
+    with torch.inference_mode(), _timing.recycling_allocator():
         times = _timing.interleave(tasks, seconds, least=drive.warm + _timing.LEAST_ROUNDS)
     count = len(times[NONE])  # before those, tasks ran to get warm
     counted = np.array(steppers[NONE].places[-count:]) >= drive.warm
@@ -145,7 +122,6 @@ def measure_scene(model: Forecaster, drive: Drive, seconds: float, threads: int,
     }
     with torch.inference_mode():
         looks = {name: stepper.look() for name, stepper in steppers.items()}
-    switches = {name: one.variant.switch for name, one in steppers.items()}
     truths = [window.truth for window in drive.windows[drive.warm :]]
     nothing, skipped = looks[NONE][0], looks[ALL][0]
     return Measured(
@@ -153,10 +129,9 @@ def measure_scene(model: Forecaster, drive: Drive, seconds: float, threads: int,
         drive.foreground,
         {name: found[counted] for name, found in times.items()},
         stages,
-        {name: looks[name][1][switch] for name, switch in switches.items() if switch in looks[name][1]},
+        {f"{of} alone": looks[f"{of} alone"][1][of] for of in SWITCHES if of in looks[f"{of} alone"][1]},
         _psnr(skipped, nothing),
         None if None in truths else (_psnr(nothing, truths), _psnr(skipped, truths)),
-        others.cores,
     )
 
 

@@ -18,7 +18,7 @@ from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.plots import bars
 from vestcl.bench.common.results import X_COPY
-from vestcl.bench.common.table import Measurement, Section, busy, verdict
+from vestcl.bench.common.table import Measurement, Section, verdict
 from vestcl.bench.common.timing import Spread, Task
 from vestcl.bench.splat import pytorch3d, torch_peer
 from vestcl.bench.splat.kernels import facts_of
@@ -103,21 +103,20 @@ def _timed(
     config: SplatBench, console: Console, title: str, sizes: Sequence[tuple[int, int, int, float]], prefix: str = ""
 ) -> Section:
     """Scenes by (height, width, channels, radius), a row each; targets where figures have no ``prefix``."""
-    rows, cores = list[Measurement](), list[float | None]()
+    rows = list[Measurement]()
     for height, width, channels, radius in sizes:
         with console.status(f"{title} {height}x{width}"), trace.stage(f"{title}, radius {radius:g}"):
             scene = street(height, width, channels, radius, config.seed)
             targets = (None, None) if prefix else TARGETS.get((height, width, radius), (None, None))
-            found, others = speed_rows(scene, config.seconds, config.threads, targets, prefix)
-            rows += found if prefix else [*found, *memory_rows(scene)]
-            cores.append(others)
+            rows += speed_rows(scene, config.seconds, config.threads, targets, prefix)
+            rows += [] if prefix else memory_rows(scene)
     plot = partial(bars, columns=("forward ms", "both ms", "copy ms"))
-    return Section(title, rows, busy(*cores), {f"splat {title}": plot})
+    return Section(title, rows, (), {f"splat {title}": plot})
 
 
 def speed_rows(
     scene: Scene, seconds: float, threads: int, targets: tuple[float | None, float | None], prefix: str
-) -> tuple[list[Measurement], float | None]:
+) -> list[Measurement]:
     """Time `splat` in turns with copies of its bytes.
 
     Args:
@@ -126,16 +125,12 @@ def speed_rows(
         threads: of the copies.
         targets: of the ratios to the copies, forward and both.
         prefix: of the figures' names.
-
-    Returns:
-        The rows, and how many cores other processes kept busy.
     """
     facts = facts_of(scene)
     copies = {"copy": _timing.memcpy(threads, scene.features)}
     copies |= {"add": _timing.memcpy(threads, scene.features, torch.ones_like(scene.features))}
     tasks: dict[str, Task] = {"forward": scene.forward, "both": both_passes(scene), **copies}
-    with _timing.watching_others() as others:
-        times = _timing.interleave(tasks, seconds)
+    times = _timing.interleave(tasks, seconds)
     copy, back_copy = times["copy"], times["add"]
     rows = [Measurement(facts.size, "fragments", f"{facts.fragments:,}")]
     for key, moved, target in zip(PASSES, (copy, copy + back_copy), targets, strict=True):
@@ -145,11 +140,11 @@ def speed_rows(
             Measurement(facts.size, f"{key} x copy", ratio, digits=".1f", name=name + X_COPY),
         ]
         if target is not None:
-            word = verdict(ratio.median <= target, others.cores)
+            word = verdict(ratio.median <= target)
             rows.append(Measurement(facts.size, f"{key} target", f"<= {target:g} {word}"))
         per_pixel = float(np.median(times[key])) * 1e9 / (facts.height * facts.width)
         rows.append(Measurement(facts.size, f"{key} ns/pixel", per_pixel, digits=".1f"))
-    return [*rows, Measurement(facts.size, "copy ms", Spread.of(copy), "s", ".2f")], others.cores
+    return [*rows, Measurement(facts.size, "copy ms", Spread.of(copy), "s", ".2f")]
 
 
 def memory_rows(scene: Scene) -> list[Measurement]:
@@ -159,7 +154,7 @@ def memory_rows(scene: Scene) -> list[Measurement]:
     before = session.scratch_bytes
     both_passes(scene)()
     scratch, features = session.scratch_bytes - before, scene.features.nbytes
-    word = verdict(scratch <= MEMORY_TARGET * features)
+    word = verdict(scratch <= MEMORY_TARGET * features, timed=False)
     return [
         Measurement(facts.size, "scratch MB", scratch, "B", ".1f", f"scratch memory, radius {facts.radius:g}"),
         Measurement(facts.size, "x features", scratch / features, digits=".2f"),
@@ -204,7 +199,7 @@ def peer_section(scene: Scene, peers: Mapping[str, Splatter], seconds: float) ->
     tasks: dict[str, Task] = {}
     for name, image_of in images.items():
         tasks |= {f"{name} forward": partial(image_of, scene), f"{name} both": both_passes(scene, image_of)}
-    with _timing.recycling_allocator(), _timing.watching_others() as others:
+    with _timing.recycling_allocator():
         times = _timing.interleave(tasks, seconds)
     truth, rows = _image_and_grads(scene.double(), _reference), list[Measurement]()
     for name, image_of in images.items():
@@ -214,13 +209,13 @@ def peer_section(scene: Scene, peers: Mapping[str, Splatter], seconds: float) ->
             rows.append(Measurement(name, f"{key} ms", Spread.of(own), "s", ".1f"))
             rows.append(Measurement(name, f"{key} x vestcl", ratio, "1", ".1f", figure, "higher"))
         if name in peers:
-            word = verdict(ratio.median >= PEER_TARGET, others.cores)
+            word = verdict(ratio.median >= PEER_TARGET)
             rows.append(Measurement(name, "target", f">= {PEER_TARGET:g} {word}"))
         got = _image_and_grads(scene, image_of)
         for key, true in truth.items():
             error = float((got[key].double() - true).norm() / true.norm())
             rows.append(Measurement(name, f"error of {key}", error, digits=".0e"))
-    return Section(f"{size} px; errors relative to the reference in float64", rows, busy(others.cores))
+    return Section(f"{size} px; errors relative to the reference in float64", rows)
 
 
 def _reference(scene: Scene) -> torch.Tensor:

@@ -65,8 +65,6 @@ class Profile:
     """By kernel, all launches of a call together."""
     calls: NDArray[np.float64]
     """From begin to end."""
-    others_cores: float | None
-    """That other processes kept busy meanwhile."""
 
     @property
     def kernels(self) -> NDArray[np.float64]:
@@ -82,7 +80,7 @@ class Profile:
 def profile(task: Task, calls: int = CALLS, before: Callable[[], object] = lambda: None) -> Profile:
     """Call ``task`` on the current device with profiling; kernels of what runs ``before`` each call are listed, too."""
     session, runs, walls = opencl.current(), [], []
-    with watching_others() as others:
+    with watching_others():
         for _ in range(calls):
             with session.profile() as times:
                 before()
@@ -95,4 +93,4 @@ def profile(task: Task, calls: int = CALLS, before: Callable[[], object] = lambd
         name: np.array([sum(one.end_ns - one.start_ns for one in times if one.name == name) / 1e9 for times in runs])
         for name in launches
     }
-    return Profile(launches, seconds, np.array(walls), others.cores)
+    return Profile(launches, seconds, np.array(walls))

@@ -15,7 +15,7 @@ from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.plots import bars
 from vestcl.bench.common.results import X_COPY
-from vestcl.bench.common.table import Measurement, Section, busy
+from vestcl.bench.common.table import Measurement, Section
 from vestcl.bench.common.timing import Spread, Task
 from vestcl.bench.splat import roofline
 from vestcl.bench.splat.kernels import profile
@@ -114,7 +114,7 @@ def operators(config: OperatorsBench) -> Iterator[Operator]:
     yield Operator("splat", splat, reference.splat, cloud, (0, 2, 3, 4))
 
 
-def measure(operator: Operator, seconds: float, threads: int) -> tuple[list[Measurement], float | None]:
+def measure(operator: Operator, seconds: float, threads: int) -> list[Measurement]:
     """Time an operator, its reference and copies in turns, then profile its kernels.
 
     Bytes are read and written, every array once. The error is the largest of the results' distances to the reference's,
@@ -126,7 +126,7 @@ def measure(operator: Operator, seconds: float, threads: int) -> tuple[list[Meas
         threads: of the copies.
 
     Returns:
-        A row for each of `PASSES`, and how many cores other processes kept busy.
+        A row for each of `PASSES`.
     """
     outputs = operator.run(operator.ours)
     grads = tuple(torch.randn_like(output) for output in outputs)
@@ -139,9 +139,8 @@ def measure(operator: Operator, seconds: float, threads: int) -> tuple[list[Meas
         for who, own in (("vestcl", ours), ("reference", others), ("copy", copies))
         for what, task in own.items()
     }
-    with _timing.watching_others() as busiest:
-        staged = {name: partial(_staged, f"{operator.name} {name}", task) for name, task in tasks.items()}
-        times = _timing.interleave(staged, seconds)
+    staged = {name: partial(_staged, f"{operator.name} {name}", task) for name, task in tasks.items()}
+    times = _timing.interleave(staged, seconds)
     rows = list[Measurement]()
     for what in PASSES:
         own, theirs, copy = (times[f"{what}, {who}"] for who in ("vestcl", "reference", "copy"))
@@ -159,7 +158,7 @@ def measure(operator: Operator, seconds: float, threads: int) -> tuple[list[Meas
             Measurement(name, "x reference", Spread.of(theirs / own), "1", ".1f", f"{name}, twin / vestcl", "higher"),
             Measurement(name, "error", error, digits=".0e"),
         ]
-    return rows, busiest.cores
+    return rows
 
 
 def _passes(operator: Operator, function: Callable[..., Any], grads: Tensors) -> dict[str, Callable[[], Tensors]]:
@@ -191,14 +190,12 @@ def _distance(got: torch.Tensor, true: torch.Tensor) -> float:
 def _sections(config: OperatorsBench, _: opencl.Session, console: Console) -> Iterator[Section]:
     """Everything on one device."""
     torch.manual_seed(config.seed)
-    rows, cores = list[Measurement](), list[float | None]()
+    rows = list[Measurement]()
     for operator in operators(config):
         with console.status(operator.name), trace.stage(operator.name):
-            found, others = measure(operator, config.seconds, config.threads)
-        rows += found
-        cores.append(others)
+            rows += measure(operator, config.seconds, config.threads)
     size = f"{config.height}x{config.width}, C = {config.channels}, radius {config.radius:g} px, float32"
-    notes = ("x copy: over a copy of the same bytes. kernels, around: of profiled calls.", *busy(*cores))
+    notes = ("x copy: over a copy of the same bytes. kernels, around: of profiled calls.",)
     plots = {
         "operators": partial(bars, columns=("ms (quartiles)", "reference ms", "copy ms")),
         "operators, kernels": partial(bars, columns=("kernels ms", "around ms")),

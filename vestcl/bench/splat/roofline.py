@@ -13,7 +13,7 @@ import numpy as np
 
 from vestcl import opencl
 from vestcl.bench.common.plots import bars
-from vestcl.bench.common.table import Measurement, Section, busy
+from vestcl.bench.common.table import Measurement, Section
 from vestcl.bench.common.timing import Spread
 from vestcl.bench.splat.kernels import Facts, facts_of, profile
 from vestcl.bench.splat.scenes import Scene, both_passes
@@ -83,7 +83,7 @@ def roofline(scene: Scene, calls: int = CALLS, copy_bytes: int = COPY_BYTES) -> 
     rows.append(Measurement("no kernel running", "ms", float(np.median(found.around)), "s", ".3f"))
     roofs_note = f"roofs: {bandwidth.median / 1e9:.1f} GB/s copied, {peak.median / 1e9:.0f} Gflop/s"
     title, plot = f"Roofline, {facts.size} px", partial(bars, columns=("ms", "least ms"))
-    return Section(title, rows, (roofs_note, *busy(found.others_cores)), {title: plot})
+    return Section(title, rows, (roofs_note,), {title: plot})
 
 
 def bytes_of(scene: Scene, facts: Facts) -> dict[str, int]:
