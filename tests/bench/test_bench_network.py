@@ -23,7 +23,8 @@ def test_a_run_writes_and_prints_everything(
         network.TARGETS, ("vest-s+joint", 32, 64), {"forward": 1e9, "training step": 1e-9, "memory": 1e9}
     )
     path = tmp_path / "new folder" / "network.json"
-    network.main(NetworkBench("vest-s+joint", **TINY, json=path))
+    network.main(NetworkBench("vest-s+joint", **TINY, json=path, plots=tmp_path / "plots"))
+    assert len(list((tmp_path / "plots").glob("*.png"))) == 2
     (result,), printed = _results.load(path), capsys.readouterr().out
     assert result.bench == "network" and result.config["model"] == "vest-s+joint" and result.config["height"] == 32
     medians = result.figures.set_index("name")["median"]

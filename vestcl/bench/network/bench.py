@@ -14,6 +14,7 @@ from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.options import Options
+from vestcl.bench.common.plots import bars
 from vestcl.bench.common.table import Measurement, Section, verdict
 from vestcl.bench.common.timing import Spread
 from vestcl.bench.network.train_step import ADAM, BACKWARD, FORWARD, OPENCL, Trainer, batch_of, made
@@ -120,9 +121,11 @@ def section(config: NetworkBench, title: str, seconds: Mapping[str, Spread]) -> 
             word = verdict(spread.median <= targets[key])
             rows.append(Measurement(name, "target", f"<= {targets[key] * 1e3:.0f} {word}"))
     memory = _timing.peak_gigabytes()
-    rows.append(Measurement("peak memory, GB", "ms (quartiles)", memory, "GB", ".2f", f"{title}: peak memory"))
+    rows.append(Measurement("peak memory", "GB", memory, "GB", ".2f", f"{title}: peak memory"))
     if "memory" in targets:
         word = verdict(memory <= targets["memory"], timed=False)
-        rows.append(Measurement("peak memory, GB", "target", f"<= {targets['memory']:g} {word}"))
+        rows.append(Measurement("peak memory", "target", f"<= {targets['memory']:g} {word}"))
     size = f"{config.height}x{config.width}, {config.threads} threads"
-    return Section(f"{config.model}, {title}, {size}", rows)
+    return Section(
+        f"{config.model}, {title}, {size}", rows, (), {f"network {title}": partial(bars, columns=("ms (quartiles)",))}
+    )
