@@ -21,6 +21,9 @@ CLIPS: Final = {
     "street:": "procedural streets, held out",
 }
 
+#: Inference presets.
+PRESETS: Final = ("exact", "balanced", "fast")
+
 #: What methods are called; others as the file has them.
 METHODS: Final = {
     "optical flow": "constant-velocity flow extrapolation",
@@ -122,15 +125,27 @@ def ablation(content: Mapping[str, Any]) -> Iterator[Row]:
 
 def presets(content: Mapping[str, Any]) -> Iterator[Row]:
     """A row per inference preset, of `vestcl bench pareto`."""
-    front = content["devices"][0]["details"]["front"]
-    points = {point["value"]: point for point in front["points"]}
-    exact = points[front["qualities"]["exact"]]
     yield ("preset", "ms/step", "delta PSNR at t+1 against `exact`, dB", "MS-SSIM", "settings")
-    for name, value in front["qualities"].items():
-        point = points[value]
-        delta = point["psnr"]["median"] - exact["psnr"]["median"]
-        time, quality = f"{point['seconds']['median'] * 1e3:.0f}", f"{point['ms_ssim']['median']:.3f}"
-        yield (f"`{name}`", time, f"{delta:+.2f}" if delta else "0", quality, "" if value == name else value)
+    (device,) = content["devices"]
+    if "details" in device:
+        front = device["details"]["front"]
+        points = {point["value"]: point for point in front["points"]}
+        found = {
+            name: (value, *(points[value][key]["median"] for key in ("seconds", "psnr", "ms_ssim")))
+            for name, value in front["qualities"].items()
+        }
+    else:
+        together = next(rows for title, rows in _tables(device).items() if title.startswith("best of"))
+        found = {
+            name: (value, *(cells[key]["median"] for key in ("time", "PSNR", "MS-SSIM")))
+            for name in PRESETS
+            for value, cells in together.items()
+            if name in cells.get("is", {"text": ""})["text"].split()
+        }
+    for name, (value, seconds, psnr, ms_ssim) in found.items():
+        delta = psnr - found["exact"][2]
+        settings = "" if value == name else value
+        yield (f"`{name}`", f"{seconds * 1e3:.0f}", f"{delta:+.2f}" if delta else "0", f"{ms_ssim:.3f}", settings)
 
 
 def speed(content: Mapping[str, Any]) -> Iterator[Row]:
@@ -142,33 +157,80 @@ def speed(content: Mapping[str, Any]) -> Iterator[Row]:
 def skipping(content: Mapping[str, Any]) -> Iterator[Row]:
     """A row per scene, of `vestcl bench pipeline`."""
     yield ("scene", "foreground", "nothing skipped, ms", "skipped, ms", "saved", "of DMVFN's time")
-    for name, scene in content["devices"][0]["details"]["scenes"].items():
-        seconds, saved = scene["seconds"], scene["saved_share"]["all skipped"]["median"]
-        before, after = (f"{seconds[key]['median'] * 1e3:.0f}" for key in ("nothing skipped", "all skipped"))
+    (device,) = content["devices"]
+    for name, shares, before, after in _scenes(device):
         label = "worst case" if name == "everything" else name
-        yield (label, f"{scene['foreground']:.0%}", before, after, f"{saved:.0%}", f"{scene['of_peer']['median']:.2f}")
+        foreground, saved, of_peer = shares
+        yield (label, foreground, f"{before * 1e3:.0f}", f"{after * 1e3:.0f}", f"{saved:.0%}", f"{of_peer:.2f}")
+
+
+def _scenes(device: Mapping[str, Any]) -> Iterator[tuple[str, tuple[str, float, float], float, float]]:
+    """Name; foreground, saved share and multiple of DMVFN's time; seconds with nothing and with all skipped."""
+    if "details" in device:
+        for name, scene in device["details"]["scenes"].items():
+            saved, of_peer = scene["saved_share"]["all skipped"]["median"], scene["of_peer"]["median"]
+            before, after = (scene["seconds"][key]["median"] for key in ("nothing skipped", "all skipped"))
+            yield name, (f"{scene['foreground']:.0%}", saved, of_peer), before, after
+        return
+    tables = _tables(device)
+    for title, rows in tables.items():
+        if title.startswith("forecast step, "):
+            name, _, rest = title.removeprefix("forecast step, ").partition(" (")
+            before, after = (rows[key]["ms (quartiles)"]["median"] for key in ("nothing skipped", "all skipped"))
+            of_peer = tables["targets"][name]["of DMVFN's"]["median"]
+            shares = rest.partition(" ")[0], rows["all skipped"]["saved"]["median"], of_peer
+            yield name, shares, before, after
 
 
 def splatting(content: Mapping[str, Any]) -> Iterator[Row]:
     """A row per radius, of `vestcl bench splat`."""
     yield ("radius, px", "fragments", "forward", "forward + backward", "scratch memory, x features")
-    (details,) = (device["details"] for device in content["devices"])
-    memory = {found["radius"]: found["ratio"] for found in details["memory"]}
-    for found in details["speed"]:
-        facts = found["facts"]
-        cells = (_time(found[key]) for key in ("forward", "both"))
-        yield (f"{facts['radius']:g}", f"{facts['fragments']:,}", *cells, f"{memory[facts['radius']]:.2f}")
+    (device,) = content["devices"]
+    if "details" in device:
+        details = device["details"]
+        memory = {found["radius"]: found["ratio"] for found in details["memory"]}
+        for found in details["speed"]:
+            facts = found["facts"]
+            of = [
+                (found[key]["time"]["median"], found[key]["copies"]["spread"]["median"]) for key in ("forward", "both")
+            ]
+            cells = (_time(*each) for each in of)
+            yield (f"{facts['radius']:g}", f"{facts['fragments']:,}", *cells, f"{memory[facts['radius']]:.2f}")
+        return
+    for name, found in _tables(device)["Splat"].items():
+        cells = (_time(found[f"{key} ms"]["median"], found[f"{key} x copy"]["median"]) for key in ("forward", "both"))
+        radius = name.rpartition("radius ")[2]
+        yield (radius, found["fragments"]["text"], *cells, f"{found['x features']['median']:.2f}")
 
 
 def opacities(content: Mapping[str, Any]) -> Iterator[Row]:
     """A row per opacity close to 1, worst errors of image and gradients, of `vestcl bench stability`."""
     peers = {"dividing": "dividing by 1 - alpha + 1e-9", "clamping": "alpha at most 0.99, T by division"}
     yield ("float32 against float64, image / gradient", "vestcl", *peers.values())
-    for row in content["devices"][0]["details"]["rows"]:
-        if row["family"] == "opacity" and row["knob"] in OPACITIES:
-            found = [row["errors"], *(row["peers"][name] for name in peers)]
-            cells = (f"{_worst(of['outputs'])} / {_worst(of['gradients'])}" for of in found)
-            yield (f"opacity {OPACITIES[row['knob']]}", *cells)
+    (device,) = content["devices"]
+    if "details" in device:
+        for row in device["details"]["rows"]:
+            if row["family"] == "opacity" and row["knob"] in OPACITIES:
+                found = [row["errors"], *(row["peers"][name] for name in peers)]
+                cells = (f"{_worst(of['outputs'])} / {_worst(of['gradients'])}" for of in found)
+                yield (f"opacity {OPACITIES[row['knob']]}", *cells)
+        return
+    rows = next(rows for title, rows in _tables(device).items() if title.startswith("opacity:"))
+    for knob, label in OPACITIES.items():
+        if (of := rows.get(f"{knob:.4g}")) is not None:
+            found = [
+                (of[f"{who}output"]["text"], of[f"{who}gradient"]["text"]) for who in ("", "dividing ", "clamping ")
+            ]
+            yield (f"opacity {label}", *(" / ".join(pair) for pair in found))
+
+
+def _tables(device: Mapping[str, Any]) -> dict[str, dict[str, dict[str, Mapping[str, Any]]]]:
+    """The cells of a bench's long table, by table, row and column."""
+    found: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}
+    for cell in device["measures"]:
+        if cell["column"]:
+            found.setdefault(cell["table"], {}).setdefault(cell["row"], {})[cell["column"]] = cell
+    return found
 
 
 def _clip(group: Mapping[str, Any]) -> str:
@@ -191,6 +253,6 @@ def _number(values: Sequence[float | None], step: int, digits: str) -> str:
     return "-" if value is None else f"{value:{digits}}"
 
 
-def _time(found: Mapping[str, Any]) -> str:
+def _time(seconds: float, copies: float) -> str:
     """ "7.4 ms, 3.5x memcpy time", the latter of the bytes that must move."""
-    return f"{found['time']['median'] * 1e3:.1f} ms, {found['copies']['spread']['median']:.1f}x memcpy time"
+    return f"{seconds * 1e3:.1f} ms, {copies:.1f}x memcpy time"

@@ -96,6 +96,48 @@ def test_opacities_by_hand() -> None:
     assert found == [("opacity 0.999", *["2.0e-07 / 3.0e-07"] * 3)]
 
 
+def long_table(*cells: tuple[str, str, str, float | str]) -> dict[str, Any]:
+    """A bench's file of (table, row, column, median or text)."""
+    kept = [
+        {
+            "table": table,
+            "row": row,
+            "column": column,
+            "median": value,
+            "text": value if isinstance(value, str) else f"{value:.1e}",
+        }
+        for table, row, column, value in cells
+    ]
+    return {"devices": [{"measures": kept}]}
+
+
+def test_tables_of_long_tables() -> None:
+    """What benches write now has no details: every figure is a cell."""
+    best = "best of 2 combinations"
+    front = long_table(
+        (best, "exact", "time", 0.211), (best, "exact", "PSNR", 25.8), (best, "exact", "MS-SSIM", 0.9579),
+        (best, "exact", "is", "front exact"), (best, "blocks 2", "time", 0.1314), (best, "blocks 2", "PSNR", 25.9),
+        (best, "blocks 2", "MS-SSIM", 0.9579), (best, "blocks 2", "is", "balanced"),
+    )  # fmt: skip
+    _, *found = rows.presets(front)
+    assert found == [("`exact`", "211", "0", "0.958", ""), ("`balanced`", "131", "+0.10", "0.958", "blocks 2")]
+    size = "256x832, C = 32, radius 1"
+    speeds = {"forward ms": 7.4e-3, "forward x copy": 3.5, "both ms": 14.21e-3, "both x copy": 3.2, "x features": 0.336}
+    cells = [("Splat", size, column, value) for column, value in speeds.items()]
+    _, row = rows.splatting(long_table(("Splat", size, "fragments", "547,540"), *cells))
+    assert row == ("1", "547,540", "7.4 ms, 3.5x memcpy time", "14.2 ms, 3.2x memcpy time", "0.34")
+    columns = [f"{who}{kind}" for who in ("", "dividing ", "clamping ") for kind in ("output", "gradient")]
+    errors = [("opacity: error", "0.001", column, 2e-7) for column in columns]
+    _, *found = rows.opacities(long_table(*errors, ("depth: error", "0.001", "output", 1.0)))
+    assert found == [("opacity 0.999", *["2.0e-07 / 2.0e-07"] * 3)]
+    step = "forecast step, jam (33% foreground), vest-s, 256x832"
+    times = {"nothing skipped": 0.167, "all skipped": 0.14}
+    scene = [(step, row, "ms (quartiles)", seconds) for row, seconds in times.items()]
+    peer = ("targets", "jam", "of DMVFN's", 0.55)
+    _, *found = rows.skipping(long_table(*scene, (step, "all skipped", "saved", 0.16), peer))
+    assert found == [("jam", "33%", "167", "140", "16%", "0.55")]
+
+
 def test_keep_reduces_paths_to_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "DOCS", tmp_path)
     (tmp_path / "results").mkdir()

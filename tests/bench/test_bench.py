@@ -12,9 +12,9 @@ from tolerances import assert_close
 
 from vestcl import reference
 from vestcl.bench.common import results as _results
+from vestcl.bench.common import table as _table
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.splat import bench as splat
-from vestcl.bench.splat import measure as _measure
 from vestcl.bench.splat import scenes as _scenes
 from vestcl.bench.splat import torch_peer as _peer
 from vestcl.bench.splat.kernels import facts_of
@@ -57,28 +57,32 @@ def test_a_run_writes_and_prints_everything(
     path = tmp_path / "new folder" / "splat.json"
     splat.main(splat.SplatBench(**TINY, scaling=True, channels=True, json=path))
     assert [file.name for file in path.parent.iterdir()] == ["splat.json"]
-    content, printed = json.loads(path.read_text(encoding="utf-8")), capsys.readouterr().out
-    (device,) = content["devices"]
-    results = device["details"]
+    (result,), printed = _results.load(path), capsys.readouterr().out
     assert {"vestcl", "torch", "numpy", "pyopencl", "device", "driver", "processor", "cores", "date"} <= set(
-        device["machine"]
+        result.machine
     )
-    assert device["config"]["radii"] == [1.0, 2.0]
-    assert [speed["facts"]["radius"] for speed in results["speed"]] == [1.0, 2.0]
-    for speed in results["speed"] + results["scaling"] + results["channels"]:
-        assert speed["facts"]["points"] == speed["facts"]["height"] * speed["facts"]["width"]
-        for name in ("forward", "both"):
-            assert 0 < speed[name]["time"]["low"] <= speed[name]["time"]["median"] <= speed[name]["time"]["high"]
-            assert speed[name]["time"]["runs"] >= _timing.LEAST_ROUNDS
-            assert speed[name]["copies"]["spread"]["median"] > 0
-    assert [[peer["name"] for peer in result["peers"]] for result in results["peers"]] == [["vestcl", "sparse"]] * 2
-    assert results["speed"][0]["forward"]["copies"]["target"] is None, "targets hold for 256x832"
-    assert all(max(peer["errors"].values()) < 2e-6 for result in results["peers"] for peer in result["peers"])
-    assert {kernel["name"] for kernel in results["kernels"][0]["kernels"]} >= {"count_tiles", "clear_gradients"}
-    assert len(results["memory"]) == 2
-    assert [speed["facts"]["channels"] for speed in results["channels"]] == [1, 3, 1, 3]
-    assert [speed["facts"]["width"] for speed in results["scaling"]] == [16, 32, 16, 32]
-    for text in ("x copy", "forward + backward", "sparse", "PyTorch3D is not installed", "GB/s", "pixels^"):
+    assert result.config["radii"] == [1.0, 2.0]
+    tables = dict(list(result.frame.groupby("table")))
+    assert len(tables) == 5
+    rows = {name: [*tables[name]["row"].unique()] for name in ("Splat", "Over size", "Over channels")}
+    assert rows["Splat"] == [f"24x50, C = 32, radius {radius}" for radius in (1, 2)]
+    sizes = [(size, radius) for radius in (1, 2) for size in ("8x16", "16x32")]
+    assert rows["Over size"] == [f"{size}, C = 32, radius {radius}" for size, radius in sizes]
+    assert rows["Over channels"] == [f"24x50, C = {count}, radius {radius}" for radius in (1, 2) for count in (1, 3)]
+    for name in rows:
+        for column in ("forward ms", "forward x copy", "both ms", "both x copy", "copy ms"):
+            own = tables[name][tables[name]["column"] == column]
+            assert (
+                (own["low"] > 0).all() and (own["low"] <= own["median"]).all() and (own["median"] <= own["high"]).all()
+            )
+            assert (own["runs"] >= _timing.LEAST_ROUNDS).all() and len(own) == len(rows[name])
+    names = [*result.figures["name"]]
+    assert len(names) == len({*names}) and "splat forward, 24x50, C = 32, radius 1, x copy" in names
+    assert {"scratch memory, radius 1", "sparse / splat forward + backward, 24x50, C = 32, radius 2"} <= {*names}
+    errors = result.frame[result.frame["column"].str.startswith("error of")]
+    assert set(errors["row"]) == {"vestcl", "sparse"} and (errors["median"] < 2e-6).all()
+    assert "forward target" not in printed, "targets hold for 256x832"
+    for text in ("forward x", "fragments", "sparse", "PyTorch3D is not installed", "scratch"):
         assert text in printed
 
 
@@ -97,9 +101,7 @@ def test_without_a_compiler_the_peers_run_as_they_are(
         raise RuntimeError("no C++ compiler\nand a long story")
 
     monkeypatch.setattr(_peer, "compiled_expand", fail)
-    expanding, compiled = splat._expanding(splat.SplatBench(), splat.Console())
-    assert expanding is _peer.expand
-    assert not compiled
+    assert splat._expanding(splat.SplatBench(), splat.Console()) is _peer.expand
     assert capsys.readouterr().out == "peers without torch.compile: no C++ compiler\n"
 
 
@@ -167,12 +169,12 @@ def test_tasks_take_turns_without_garbage_collection() -> None:
     assert gc.isenabled()
 
 
-def test_a_busy_machine_decides_nothing() -> None:
-    spread, cores = _timing.Spread(3.0, 2.0, 4.0, 5), _timing.os.cpu_count()
-    assert _measure.ratio(spread, 4.0, 0.0)["reached"] is True
-    assert _measure.ratio(spread, 4.0, None, at_most=False)["reached"] is False
-    assert _measure.ratio(spread, 2.0, 0.5 * cores, at_most=False)["reached"] is None
-    assert _measure.ratio(spread, None, 0.0, at_most=False)["reached"] is None
+def test_a_busy_machine_proves_no_target_missed() -> None:
+    for cores, word in ((0.0, "missed"), (0.5 * (_timing.os.cpu_count() or 1), "can't tell")):
+        token = _timing.busy_cores.set(cores)
+        assert _table.verdict(True) == "reached" and _table.verdict(False) == word
+        assert _table.verdict(False, timed=False) == "missed"
+        _timing.busy_cores.reset(token)
 
 
 def test_spread_is_median_and_quartiles() -> None:
@@ -180,16 +182,7 @@ def test_spread_is_median_and_quartiles() -> None:
 
 
 def test_copies_move_what_they_say() -> None:
-    features = torch.randn(1, 7, 5)
-    for copies in (_timing.copies_of_forward(features, 2), _timing.copies_of_backward(features, 2)):
-        for name, task in copies.items():
-            result = task()
-            if isinstance(result, torch.Tensor):
-                assert torch.equal(result, features if name == "torch copy_" else features + 1)
-            else:
-                assert len(result) == 2
-
-
-@pytest.mark.parametrize("power", [1.0, 1.5])
-def test_growth_finds_the_power(power: float) -> None:
-    assert _measure.growth([10, 20, 40], [3 * n**power for n in (10, 20, 40)]) == pytest.approx(power)
+    features, ones = torch.randn(1, 7, 5), torch.ones(1, 7, 5)
+    for sources, wanted in (((features,), features), ((features, ones), features + 1)):
+        shares = _timing.memcpy(2, *sources)()
+        assert len(shares) == 2 and np.array_equal(np.concatenate(shares), wanted.reshape(-1).numpy())

@@ -2,24 +2,33 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from vestcl.bench.common import compare
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.compare import CompareBench
-from vestcl.bench.common.results import X_COPY, Measure, Results
+from vestcl.bench.common.results import X_COPY, Results
+from vestcl.bench.common.table import Measurement, Section
+from vestcl.bench.common.timing import Spread
 from vestcl.cli import main as cli
 
 
-def measure(name: str, median: float, spread: float = 0.1, unit: str = "s", better: str = "lower") -> Measure:
-    return Measure(name, unit, median, median * (1 - spread), median * (1 + spread), better)  # type: ignore[arg-type]
+def measure(name: str, median: float, spread: float = 0.1, unit: str = "s", better: str = "lower") -> Measurement:
+    values = Spread(median, median * (1 - spread), median * (1 + spread), 1)
+    return Measurement(name, "", values, unit, name=name, better=better)  # type: ignore[arg-type]
 
 
-def results(*measures: Measure, bench: str = "splat", **machine: str) -> Results:
-    return Results(bench, {"device": "0:0 a", "date": "x", **machine}, {"height": 8}, list(measures), [], {})
+def frame(measures: Sequence[Measurement]) -> pd.DataFrame:
+    return Section("", measures).frame if measures else pd.DataFrame(columns=_results.COLUMNS)
+
+
+def results(*measures: Measurement, bench: str = "splat", **machine: str) -> Results:
+    return Results(bench, {"device": "0:0 a", "date": "x", **machine}, {"height": 8}, frame(measures))
 
 
 @pytest.fixture(autouse=True)
@@ -41,12 +50,12 @@ def files(tmp_path: Path) -> Any:
     return write
 
 
-def verdicts(before: list[Measure], after: list[Measure]) -> list[str]:
-    return list(compare.compare(before, after)["verdict"])
+def verdicts(before: list[Measurement], after: list[Measurement]) -> list[str]:
+    return list(compare.compare(frame(before), frame(after))["verdict"])
 
 
-def changes(before: list[Measure], after: list[Measure]) -> list[Any]:
-    return list(compare.compare(before, after).itertuples())
+def changes(before: list[Measurement], after: list[Measurement]) -> list[Any]:
+    return list(compare.compare(frame(before), frame(after)).itertuples())
 
 
 # ---------------------------------------------------------------- what counts as a change
@@ -85,7 +94,7 @@ def test_a_ratio_in_one_run_alone_counts_for_nothing() -> None:
 
 
 def test_unknown_numbers_and_zeros() -> None:
-    unknown = Measure("a", "s", math.nan, math.nan, math.nan)
+    unknown = measure("a", math.nan)
     (change,) = changes([measure("a", 1.0)], [unknown])
     assert change.verdict == "noise" and math.isnan(change.percent)
     (change,) = changes([measure("a", 0.0, 0, "B")], [measure("a", 5.0, 0, "B")])
@@ -94,7 +103,7 @@ def test_unknown_numbers_and_zeros() -> None:
 
 def test_units_must_agree() -> None:
     with pytest.raises(ValueError, match="`after` must have a in 's', got 'B'"):
-        compare.compare([measure("a", 1.0)], [measure("a", 1.0, unit="B")])
+        verdicts([measure("a", 1.0)], [measure("a", 1.0, unit="B")])
 
 
 # ---------------------------------------------------------------- the command

@@ -10,8 +10,8 @@ import pytest
 from vestcl.bench.forecast import bench
 from vestcl.bench.forecast import run as running
 from vestcl.bench.forecast.bench import ForecastBench
-from vestcl.bench.forecast.kept import SUFFIX, Facts, Kept
-from vestcl.bench.forecast.windows import groups_of, read_list
+from vestcl.bench.forecast.run import SUFFIX, Kept
+from vestcl.bench.forecast.windows import Facts, groups_of, read_list
 from vestcl.data import Street, street_clip
 from vestcl.data.sample import Clip, Sample
 from vestcl.evaluation.regions import REGIONS, error_shares

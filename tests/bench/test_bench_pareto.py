@@ -1,11 +1,11 @@
 """`vestcl bench pareto`: that it measures, marks and writes what it says. No time is judged."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from forecaster_scenes import SMALL, stir
@@ -15,7 +15,7 @@ from vestcl.bench.common.timing import Spread
 from vestcl.bench.pareto import bench as pareto
 from vestcl.bench.pareto import plots
 from vestcl.bench.pareto.bench import ParetoBench
-from vestcl.bench.pareto.knobs import EXACT, combinations, combined, describe, setting_of
+from vestcl.bench.pareto.knobs import EXACT, combinations, describe, options_of, setting_of
 from vestcl.bench.pareto.measure import PRICE, Point, front, knee
 from vestcl.bench.pareto.scenes import double, scene, shrunk
 from vestcl.models.forecaster import Forecaster
@@ -42,78 +42,87 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def details(folder: Path) -> dict[str, Any]:
+def tables(folder: Path) -> dict[str, pd.DataFrame]:
     (result,) = load(folder / "new" / "p.json")
     assert result.bench == "pareto" and result.config["seeds"] == [1100] and result.machine["device"]
-    return result.details
+    return plots.tables(result)
 
 
-def test_every_knob_is_measured(details: dict[str, Any]) -> None:
+@pytest.fixture(scope="module")
+def knobs(tables: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """Points by knob."""
+    return {title.partition(":")[0]: plots.points(frame) for title, frame in tables.items() if ":" in title}
+
+
+def test_every_knob_is_measured(knobs: dict[str, pd.DataFrame]) -> None:
     names = {"skipping", "min_transmittance", "splat_scale", "precision", "image size", "paint_scale", "blocks"}
-    assert set(details["knobs"]) == names | {"margin"}
-    for knob in details["knobs"].values():
-        exact = knob["points"][0]
-        values = [point["value"] for point in knob["points"]]
-        assert len(set(values)) == len(values) > 1 and knob["default"] == values[0] and knob["knee"] in values
-        assert exact["setting"] == {} and exact["loss"] == 0 and exact["rms"]["median"] < 1e-4
-        for point in knob["points"]:
-            assert 0 < point["seconds"]["low"] <= point["seconds"]["median"] <= point["seconds"]["high"]
-            assert point["rms"]["median"] >= 0 and 5 < point["psnr"]["median"] < 60 and point["loss"] <= point["worst"]
-            assert exact["psnr"]["median"] - point["psnr"]["median"] == pytest.approx(point["loss"], abs=1e-5)
+    assert set(knobs) == names | {"margin"}
+    for found in knobs.values():
+        exact = found.iloc[0]
+        assert found.index.is_unique and len(found) > 1 and exact["loss"] == 0 and exact["rms"] < 1e-4
+        assert exact["is"].startswith("default") and found["is"].str.contains("knee").sum() == 1
+        assert (
+            (found["low"] > 0).all()
+            and (found["low"] <= found["time"]).all()
+            and (found["time"] <= found["high"]).all()
+        )
+        assert (found["rms"] >= 0).all() and found["PSNR"].between(5, 60).all()
+        assert np.allclose(exact["PSNR"] - found["PSNR"], found["loss"], atol=1e-5)
 
 
-def test_what_is_exact_stays_near_float64(details: dict[str, Any]) -> None:
-    for point in details["knobs"]["skipping"]["points"]:
-        assert point["rms"]["median"] < 1e-4
-    rms = [point["rms"]["median"] for point in details["knobs"]["min_transmittance"]["points"]]
+def test_what_is_exact_stays_near_float64(knobs: dict[str, pd.DataFrame]) -> None:
+    assert (knobs["skipping"]["rms"] < 1e-4).all()
+    rms = [*knobs["min_transmittance"]["rms"]]
     assert rms == sorted(rms) and rms[-1] > 1e-3
 
 
-def test_the_front_holds_the_named_qualities(details: dict[str, Any]) -> None:
-    together = details["front"]
-    points = {point["value"]: point for point in together["points"]}
-    assert set(together["qualities"].values()) | {together["knee"], "exact"} <= set(points)
-    for value in together["best"]:
-        other = points[value]
-        assert not any(
-            point["loss"] < other["loss"] and point["seconds"]["median"] < other["seconds"]["median"]
-            for point in points.values()
-        )
+def test_the_front_holds_the_named_qualities(tables: dict[str, pd.DataFrame]) -> None:
+    found = plots.points(next(frame for title, frame in tables.items() if title.startswith(plots.COMBINATIONS)))
+    assert all(found["is"].str.contains(level).sum() == 1 for level in quality.LEVELS) and "exact" in found.index
+    for _, one in found[found["is"].str.startswith("front")].iterrows():
+        assert not ((found["loss"] < one["loss"]) & (found["time"] < one["time"])).any()
 
 
-def test_several_steps(details: dict[str, Any]) -> None:
-    rows = {(row["mode"], row["steps"]): row for row in details["recursion"]}
-    assert set(rows) == {(mode, steps) for mode in ("compose", "feedback") for steps in (1, 3, 5)}
-    assert rows["compose", 1]["psnr"] == rows["feedback", 1]["psnr"]
-    assert rows["compose", 5]["psnr"]["median"] < rows["compose", 1]["psnr"]["median"]
+def test_several_steps(tables: dict[str, pd.DataFrame]) -> None:
+    found = plots.points(tables[plots.STEPS])
+    assert set(found.index) == {f"{mode} to t+{steps}" for mode in ("compose", "feedback") for steps in (1, 3, 5)}
+    psnr = found["PSNR"]
+    assert psnr["compose to t+1"] == psnr["feedback to t+1"] and psnr["compose to t+5"] < psnr["compose to t+1"]
 
 
-def test_files(folder: Path, details: dict[str, Any]) -> None:
+def test_files(folder: Path, knobs: dict[str, pd.DataFrame]) -> None:
     markdown = (folder / "p.md").read_text(encoding="utf-8")
-    assert all(f"**{name}" in markdown for name in details["knobs"]) and "bfloat16" in markdown
+    assert all(f"**{name}" in markdown for name in knobs) and "bfloat16" in markdown
     drawn = {path.stem for path in (folder / "plots").glob("*.png")}
-    assert drawn == {
-        "front",
-        "recursion",
-        *(name.replace(" ", "-").replace("_", "-") for name in details["knobs"]),
-    }
-    measures = json.loads((folder / "new" / "p.json").read_text(encoding="utf-8"))["devices"][0]["measures"]
-    names = [measure["name"] for measure in measures]
+    assert drawn == {"front", "recursion", *(name.replace(" ", "-").replace("_", "-") for name in knobs)}
+    (result,) = load(folder / "new" / "p.json")
+    names = [*result.figures["name"]]
     assert len(set(names)) == len(names) and {"precision bfloat16, time", "blocks all, PSNR"} <= set(names)
 
 
-def test_figures_show_what_there_is(details: dict[str, Any]) -> None:
-    figure = plots.knob_figure("precision", details["knobs"]["precision"])
-    left, right = figure.axes
+def test_figures_show_what_there_is(tables: dict[str, pd.DataFrame]) -> None:
+    (title,) = (title for title in tables if title.startswith("precision"))
+    left, right = plots.draw(tables[title], title).axes
     assert {text.get_text() for text in left.texts} == {"float32", "bfloat16"}
-    assert right.get_xlabel() == "ms/step" and right.get_legend() is not None
-    (axes,) = plots.front_figure(details["front"]).axes
+    assert right.get_xlabel() == "ms/step" and right.get_ylabel() == "PSNR drop, dB"
+    (title,) = (title for title in tables if title.startswith(plots.COMBINATIONS))
+    (axes,) = plots.draw(tables[title], title).axes
     assert {text.get_text() for text in axes.texts if text.get_text()} == set(quality.LEVELS)
+
+
+def test_files_of_earlier_versions_are_drawn() -> None:
+    (result,) = load(Path(__file__).parents[2] / "docs" / "time_against_error" / "pareto.json")
+    tables = plots.tables(result)
+    assert len(tables) == len(result.details["knobs"]) + 2
+    for title, frame in tables.items():
+        assert plots.draw(frame, title).axes
+    blocks = plots.points(tables["blocks: the first of 6 blocks of object motion"])
+    assert blocks["loss"].to_dict() == {p["value"]: p["loss"] for p in result.details["knobs"]["blocks"]["points"]}
 
 
 def point(value: str, seconds: float, loss: float, noise: float = 0.0) -> Point:
     one = Spread(1, 1, 1, 1)
-    return Point(value, {}, Spread(seconds, seconds - noise, seconds + noise, 3), one, one, one, loss, loss)
+    return Point(value, Spread(seconds, seconds - noise, seconds + noise, 3), one, one, one, loss, loss)
 
 
 def test_front_and_knee_by_hand() -> None:
@@ -129,12 +138,12 @@ def test_front_and_knee_by_hand() -> None:
 
 def test_settings_are_combined_and_described() -> None:
     given = InferenceOptions(margin=3, blocks=2, autocast="bfloat16")
-    assert setting_of(given) == {"skip": {"margin": 3}, "effort": {"blocks": 2}, "autocast": "bfloat16"}
+    assert setting_of(given) == {"margin": 3, "blocks": 2, "autocast": "bfloat16"}
     assert setting_of(InferenceOptions()) == EXACT
     nothing = InferenceOptions().without_skips()
-    assert InferenceOptions.from_dict(setting_of(nothing)) == nothing
-    both = combined([{"effort": {"blocks": 2}}, {"skip": {"margin": 0}}, {"effort": {"paint_scale": 0.5}}])
-    assert both == {"effort": {"blocks": 2, "paint_scale": 0.5}, "skip": {"margin": 0}}
+    assert options_of(setting_of(nothing)) == nothing and options_of({"size": 0.5}) == InferenceOptions()
+    (both,) = combinations([[{"blocks": 2}], [{"margin": 0}], [{"paint_scale": 0.5}]])
+    assert both == {"blocks": 2, "paint_scale": 0.5, "margin": 0}
     assert describe(both) == "margin 0, blocks 2, paint_scale 0.5" and describe(EXACT) == "exact"
     every = combinations([[EXACT, {"size": 0.5}], [EXACT, {"autocast": "bfloat16"}]])
     assert len(every) == 4 and every[0] == EXACT and every[-1] == {"autocast": "bfloat16", "size": 0.5}

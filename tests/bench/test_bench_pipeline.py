@@ -12,17 +12,15 @@ from forecaster_scenes import OBJECTS, SMALL, stir
 from PIL import Image
 
 from vestcl.bench.common import results as _results
-from vestcl.bench.common.timing import Spread
+from vestcl.bench.common.timing import busy_cores
 from vestcl.bench.pipeline import traffic as _traffic
-from vestcl.bench.pipeline.bench import PipelineBench, load, main, verdicts, word
-from vestcl.bench.pipeline.measure import ALL, NONE, PEER, SWITCHES, TWICE, Stepper, variants
+from vestcl.bench.pipeline.bench import PipelineBench, load, main, verdicts
+from vestcl.bench.pipeline.measure import ALL, NONE, PEER, SWITCHES, Stepper, variants
 from vestcl.bench.pipeline.traffic import EMPTY, EVERYTHING, JAM, STREETS, TRAFFIC, drive
 from vestcl.models.config import EncoderConfig
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.options import InferenceOptions
 from vestcl.models.inference.stage_times import REST, STAGES
-from vestcl.models.steps import render as _render
-from vestcl.ops.splat import rasterize
 
 HEIGHT, WIDTH = 32, 96
 
@@ -80,41 +78,31 @@ def test_everything_needs_everything(drives: dict[str, _traffic.Drive]) -> None:
     near = torch.nn.functional.max_pool2d(1 - scene.windows[0].frames[0].mask, 8, stride=1)
     assert near.min() == 1
     with torch.no_grad():
-        _, counts = Stepper(model(), variants(InferenceOptions(covered=True, still=True))[-1], scene).look()
+        _, counts = Stepper(model(), ALL, InferenceOptions(covered=True, still=True), scene).look()
     assert all(counts[switch].skipped == 0 < counts[switch].of for switch in ("seen", "background", "objects", "views"))
     assert counts["covered"].skipped < 0.8 * counts["covered"].of
 
 
 def test_variants_switch_one_on() -> None:
-    found = {variant.name: variant for variant in variants(InferenceOptions(margin=8))}
-    assert list(found) == [NONE, TWICE, *(f"{switch} alone" for switch in SWITCHES), ALL]
+    found = variants(InferenceOptions(margin=8))
+    assert list(found) == [NONE, *(f"{switch} alone" for switch in SWITCHES), ALL]
     for switch in SWITCHES:
-        skip = found[f"{switch} alone"].options
+        skip = found[f"{switch} alone"]
         assert [getattr(skip, other) for other in SWITCHES] == [other == switch for other in SWITCHES]
         assert skip.margin == 8
-    assert found["views alone"].base == TWICE and found["seen alone"].base == NONE
-    assert found[NONE].options == InferenceOptions(margin=8).without_skips()
+    assert found[NONE] == InferenceOptions(margin=8).without_skips() and found[ALL] == InferenceOptions(margin=8)
 
 
 def test_what_is_skipped_is_counted_and_changes_nothing(drives: dict[str, _traffic.Drive]) -> None:
     with torch.no_grad():
         for name in (EMPTY, TRAFFIC):
-            nothing, _ = Stepper(model(), variants(InferenceOptions())[0], drives[name]).look()
-            everything, counts = Stepper(model(), variants(InferenceOptions())[-1], drives[name]).look()
+            nothing, _ = Stepper(model(), NONE, InferenceOptions().without_skips(), drives[name]).look()
+            everything, counts = Stepper(model(), ALL, InferenceOptions(), drives[name]).look()
             assert len(nothing) == len(everything) == 1
             assert torch.allclose(nothing[0], everything[0], atol=1e-4)
             assert counts["seen"][:2] == (1, 2)
             if name == EMPTY:
                 assert all(counts[switch].skipped == counts[switch].of > 0 for switch in ("background", "objects"))
-
-
-def test_what_the_splatter_leaves_out(drives: dict[str, _traffic.Drive]) -> None:
-    with torch.no_grad():
-        counts = Stepper(model(), variants(InferenceOptions())[0], drives[EVERYTHING]).splatter()
-    assert vars(_render)["rasterize"] is rasterize
-    points = counts["points without fragments"]
-    assert 0 < points.skipped < points.of and 2 * HEIGHT * WIDTH < points.of <= 3 * HEIGHT * WIDTH
-    assert counts["empty tiles"].of > 0 and counts["saturated pixels"].of == 2 * HEIGHT * WIDTH
 
 
 def test_a_run_writes_and_prints_everything(
@@ -140,18 +128,19 @@ def test_a_run_writes_and_prints_everything(
     )
     (result,), printed = _results.load(tmp_path / "new folder" / "pipeline.json"), capsys.readouterr().out
     assert result.bench == "pipeline" and result.config["quality"] == "exact"
-    names = {measure.name: measure for measure in result.measures}
+    figures = result.figures.set_index("name")
     for scene in (EMPTY, EVERYTHING):
         for variant in (NONE, ALL, "seen alone", PEER, "copy", "inpaint"):
-            assert names[f"{scene}: {variant}"].median > 0 and names[f"{scene}: {variant}"].unit == "s"
+            assert figures["median"][f"{scene}: {variant}"] > 0 and figures["unit"][f"{scene}: {variant}"] == "s"
         for stage in (*STAGES.values(), REST):
-            assert names[f"{scene}: {NONE}: {stage}"].median >= 0
-        found = result.details["scenes"][scene]
-        whole = names[f"{scene}: {NONE}"]
-        assert found["seconds"][NONE]["runs"] == whole_runs(found) >= 2 and whole.low <= whole.median <= whole.high
-    assert names[f"{EMPTY}: lost"].unit == "dB" and f"{EVERYTHING}: lost" not in names
-    assert result.details["counts"][EMPTY]["objects"]["skipped"] == result.details["counts"][EMPTY]["objects"]["of"]
-    assert len(result.details["targets"]) == 4
+            assert figures["median"][f"{scene}: {NONE}: {stage}"] >= 0
+        whole = figures.loc[f"{scene}: {NONE}"]
+        assert whole["runs"] == figures["runs"][f"{scene}: {NONE}: refine"] >= 2
+        assert whole["low"] <= whole["median"] <= whole["high"]
+    assert figures["unit"][f"{EMPTY}: lost"] == "dB" and f"{EVERYTHING}: lost" not in figures.index
+    skipped = result.frame[(result.frame["column"] == "skipped") & (result.frame["row"] == "objects alone")]
+    assert skipped["text"].iloc[0].startswith("100% of")
+    assert result.frame["column"].str.startswith("target ").sum() == 4
     (plot,) = (tmp_path / "plots").iterdir()
     with Image.open(plot) as picture:
         assert picture.width > 1000 and len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
@@ -159,16 +148,11 @@ def test_a_run_writes_and_prints_everything(
     assert {"encode", "splat", NONE, ALL, PEER, EMPTY} <= {event["name"] for event in events}
     for text in (
         "forecast step, empty road (0% foreground)",
-        "views alone",
+        "covered alone",
         "targets",
-        "skipping saves",
-        "empty tiles",
+        "against nothing",
     ):
         assert text in printed and text in (tmp_path / "pipeline.md").read_text(encoding="utf-8")
-
-
-def whole_runs(found: dict[str, Any]) -> int:
-    return int(found["stages"][NONE]["refine"]["runs"])
 
 
 @pytest.mark.parametrize(
@@ -184,15 +168,10 @@ def whole_runs(found: dict[str, Any]) -> int:
     ],
 )
 def test_verdicts(name: str, of_peer: float, saved: float, loss: float | None, cores: float, words: list[str]) -> None:
-    def always(value: float) -> Spread:
-        return Spread(value, value, value, 1)
-
-    pictures = {"truth_nothing": None, "truth_all": None}
-    if loss is not None:
-        pictures = {"truth_nothing": 30 + loss, "truth_all": 30.0}
-    scene = {"name": name, "saved_share": {ALL: always(saved)}, "of_peer": always(of_peer), "pictures": pictures}
-    targets = verdicts(scene | {"others_cores": cores})
-    assert [word(target) for target in targets] == words
+    token = busy_cores.set(cores)
+    found = verdicts(name, of_peer, saved, loss)
+    busy_cores.reset(token)
+    assert [text.split(" ", 2)[2] for text in found.values()] == words
 
 
 def test_load_takes_quality_and_precision(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 from rich.console import Console
@@ -17,18 +18,23 @@ from vestcl import doctor, opencl
 from vestcl.bench.common import plots as _plots
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import table as _table
-from vestcl.bench.common.results import Measure, Results
-from vestcl.bench.common.timing import Spread
+from vestcl.bench.common.options import Options
+from vestcl.bench.common.results import Results
+from vestcl.bench.common.timing import Spread, busy_cores
 from vestcl.evaluation.tables import Grid
 
 
-def results(bench: str = "abacus", device: str = "0:0 frame", **details: Any) -> Results:
-    measures = [
-        Measure("beads moved", "s", 2.0, 1.0, 3.0),
-        Measure("beads kept", "1", math.nan, 0.0, 1.0, "higher"),
+def results(bench: str = "abacus", device: str = "0:0 frame", **config: Any) -> Results:
+    rows = [
+        _table.Measurement("moved", "ms", Spread(2e-3, 1e-3, 3e-3, 5), "s", ".0f", "beads moved"),
+        _table.Measurement("[red]kept", "ms", math.nan, "1", name="beads kept", better="higher"),
     ]
-    grid = Grid("Beads", ("", "ms"), (("moved", "2"), ("[red]kept", "-")), ("a note",))
-    return Results(bench, {"device": device, "date": "now"}, {"rows": 9}, measures, [grid], details)
+    section = _table.Section("Beads", rows, ("a note",))
+    return Results(bench, {"device": device, "date": "now"}, {"rows": 9, **config}, section.frame, [section.grid()])
+
+
+FIGURE = """{"vestcl": 1, "bench": "abacus", "devices": [{"machine": {}, "config": {}, "measures": [
+    {"name": "a", "unit": "s", "median": 1.0, "low": 1, "high": 1, "better": "lower"}]}]}"""
 
 
 @pytest.fixture
@@ -62,13 +68,14 @@ def test_what_is_saved_comes_back(tmp_path: Path) -> None:
     assert sorted(file.name for file in path.parent.iterdir()) == ["r.json", "r.md"]
     content = json.loads(path.read_text(encoding="utf-8"), parse_constant=pytest.fail)
     assert content["vestcl"] == 1 and content["bench"] == "abacus"
-    assert [set(device) for device in content["devices"]] == [{"machine", "config", "measures", "details"}] * 2
+    assert [set(device) for device in content["devices"]] == [{"machine", "config", "measures"}] * 2
     loaded = _results.load(path)
     assert [result.grids for result in loaded] == [[], []]
     for one, two in zip(loaded, saved, strict=True):
-        assert (one.bench, one.machine, one.config, one.details) == (two.bench, two.machine, two.config, two.details)
-        assert one.measures[0] == two.measures[0]
-        assert math.isnan(one.measures[1].median) and one.measures[1].better == "higher"
+        assert (one.bench, one.machine, one.config) == (two.bench, two.machine, two.config)
+        pd.testing.assert_frame_equal(one.frame, two.frame, check_like=True)
+        assert list(one.figures["name"]) == ["beads moved", "beads kept"]
+        assert math.isnan(one.frame["median"][1]) and one.frame["better"][1] == "higher"
     text = markdown.read_text(encoding="utf-8")
     assert "0:0 frame" in text and "1:0 other" in text and text.count("| moved | 2 |") == 2 and "- date: now" in text
 
@@ -81,7 +88,7 @@ def test_nothing_is_written_where_no_file_is_asked_for(tmp_path: Path, monkeypat
 
 @pytest.mark.parametrize(
     ("saved", "message"),
-    [([], "got none"), ([results(), results("lute")], "got abacus, lute"), ([results(x=object())], "got object")],
+    [([results(x=object())], "got object")],
 )
 def test_what_can_not_be_saved_leaves_the_old_file(tmp_path: Path, saved: list[Results], message: str) -> None:
     path = tmp_path / "r.json"
@@ -101,7 +108,7 @@ def test_what_can_not_be_saved_leaves_the_old_file(tmp_path: Path, saved: list[R
         ('{"vestcl": 1, "bench": "abacus"}', "lacks or mistakes 'devices'"),
         ('{"vestcl": 1, "bench": "abacus", "devices": [{"measures": [{"median": 1}]}]}', "lacks or mistakes 'low'"),
         ('{"vestcl": 1, "bench": "abacus", "devices": [[]]}', "lacks or mistakes"),
-        ('{"vestcl": 1, "bench": "abacus", "devices": [{"measures": [{"median": "x"}]}]}', "float: 'x'"),
+        (FIGURE.replace("1.0", '"x"'), "float: 'x'"),
     ],
 )
 def test_other_files_are_refused(tmp_path: Path, content: str, message: str) -> None:
@@ -129,25 +136,30 @@ def test_plain_values() -> None:
     }
 
 
-def test_a_measure_of_a_spread() -> None:
-    assert Measure.of("a", "s", Spread(2.0, 1.0, 3.0, 7)) == Measure("a", "s", 2.0, 1.0, 3.0, "lower")
+def test_files_of_earlier_versions_have_figures_and_details(tmp_path: Path) -> None:
+    figure = {"name": "a", "unit": "s", "median": 2.0, "low": 1.0, "high": None, "better": "lower"}
+    device = {"machine": {}, "config": {}, "measures": [figure], "details": {"beads": [1]}}
+    path = tmp_path / "earlier.json"
+    path.write_text(json.dumps({"vestcl": 1, "bench": "abacus", "devices": [device]}), encoding="utf-8")
+    (found,) = _results.load(path)
+    assert found.details == {"beads": [1]}
+    (row,) = found.figures.to_dict("records")
+    assert (row["name"], row["median"], row["table"], row["column"]) == ("a", 2.0, "", "") and math.isnan(row["high"])
 
 
-def test_sections_become_figures_tables_and_details(console: Console) -> None:
+def test_sections_become_figures_and_tables(console: Console) -> None:
     rows = [
         _table.Measurement("moved", "ms", Spread(2e-3, 1e-3, 3e-3, 5), "s", name="beads moved"),
         _table.Measurement("moved", "verdict", "<= 4 reached"),
         _table.Measurement("kept", "ms", math.nan, "s", ".1f"),
         _table.Measurement("kept", "", 0.5, name="beads kept", better="higher"),
     ]
-    sections = [_table.Section("Beads", rows, ("a note",), {"beads": [1]}), _table.Section("", [], (), {"beads": [2]})]
-    found = _results.collect("abacus", {"device": "0:0"}, {}, sections, console)
-    assert found.measures == [
-        Measure("beads moved", "s", 2e-3, 1e-3, 3e-3),
-        Measure("beads kept", "1", 0.5, 0.5, 0.5, "higher"),
-    ]
-    assert found.details == {"beads": [1, 2]}
-    (grid,) = found.grids
+    section = _table.Section("Beads", rows, ("a note",))
+    figures = section.frame[section.frame["name"] != ""].set_index("name")
+    assert list(figures.index) == ["beads moved", "beads kept"] and set(figures["table"]) == {"Beads"}
+    assert list(figures["median"]) == [2e-3, 0.5] and list(figures["better"]) == ["lower", "higher"]
+    grid = section.grid()
+    _table.show_grid(grid, console)
     assert grid.heading == ("", "ms", "verdict") and grid.notes == ("a note",)
     assert grid.rows == (("moved", "2.00 (1.00-3.00)", "<= 4 reached"), ("kept", "-", ""))
     text = console.export_text()
@@ -246,24 +258,25 @@ CELLS = (("y", "a", SPREADS[1]), ("x", "b", SPREADS[1]), ("y", "b", SPREADS[0]))
 
 
 def test_plots_are_pictures(tmp_path: Path) -> None:
-    lines = [_plots.Curve("a", [64, 256], SPREADS, 1e3), _plots.Curve("b", [64, 256], SPREADS[::-1], dashed=True)]
-    curves = _plots.curves(tmp_path / "new" / "curves.png", "title", "points", "ms", lines)
+    lines = [
+        _plots.Curve("a", [64, 256], [0.1, 9.0]),
+        _plots.Curve("", [64, 90], [1, 2], "s--", "xy", ([60, 89], [70, 95])),
+    ]
     rows = [_table.Measurement(row, column, one, "s") for row, column, one in (("x", "a", SPREADS[0]), *CELLS)]
-    frame = _table.long_table(rows)
-    bars = [_plots.bars(tmp_path / f"{stacked}.png", "title", frame, stacked) for stacked in (False, True)]
-    for path in (curves, *bars):
+    frame = _table.Section("", [*rows, _table.Measurement("y", "c", "text")]).frame
+    figures = [
+        _plots.curves("title", "points", {"ms": lines, "dB": lines}),
+        *(_plots.bars(frame, "title", ("a", "b"), stacked) for stacked in (False, True)),
+    ]
+    assert [axes.get_yscale() for axes in figures[0].axes] == ["log", "log"]
+    assert [axes.get_xscale() for axes in figures[0].axes] == ["linear", "linear"]
+    for number, figure in enumerate(figures):
+        path = tmp_path / "new" / f"{number}.png"
+        _plots.write(figure, path)
         picture = np.asarray(Image.open(path).convert("L"))
         assert picture.shape[1] == 1200 and picture.shape[0] >= 300
         assert 0.5 < (picture > 250).mean() < 0.999, "something is drawn on white"
         assert (picture[:, [0, -1]] > 250).mean() > 0.9, "nothing runs over the edge"
-
-
-def test_plots_of_nothing_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="`lines` must be one or more"):
-        _plots.curves(tmp_path / "a.png", "", "", "", [])
-    with pytest.raises(ValueError, match="`frame` must have one or more rows"):
-        _plots.bars(tmp_path / "a.png", "", _table.long_table([]))
-    assert not list(tmp_path.iterdir())
 
 
 def test_file_names() -> None:
@@ -271,9 +284,20 @@ def test_file_names() -> None:
 
 
 def test_verdicts_are_coloured_and_text_is_no_markup(console: Console) -> None:
-    grid = Grid("[b]title", ("", "target"), (("[red]a", "<= 6 reached"), ("b", "missed it")), _table.busy(1e6))
+    grid = Grid("[b]title", ("", "target"), (("[red]a", "<= 6 reached"), ("b", "missed it")), ("busy: measure again",))
     _table.show_grid(grid, console)
     plain, styled = console.export_text(clear=False), console.export_text(styles=True)
     assert "[b]title" in plain and "[red]a" in plain and "measure again" in " ".join(plain.split())
     assert "\x1b[32mreached" in styled and "\x1b[31mmissed" not in styled
-    assert _table.busy(0.0, None) == ()
+
+
+def test_a_disturbed_section_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    def sections(*_: Any) -> Iterator[_table.Section]:
+        for cores in (0.0, 9.0, 0.0):
+            busy_cores.set(cores)
+            yield _table.Section(f"table {cores}", [_table.Measurement("a", "b", "c")])
+
+    _results.run("abacus", Options(), sections)
+    quiet, disturbed, again = capsys.readouterr().out.split("\ntable ")[1:]
+    assert "kept 9.0 cores busy meanwhile: measure again" in " ".join(disturbed.split())
+    assert "busy" not in quiet and "busy" not in again

@@ -7,6 +7,7 @@ import torch
 from forecaster_scenes import PAINTING, SMALL, TINY
 
 from vestcl.bench.common.results import load
+from vestcl.bench.pareto import plots
 from vestcl.bench.pareto.knobs import describe, setting_of
 from vestcl.bench.pareto.measure import step
 from vestcl.bench.pareto.scenes import Scene, scene
@@ -54,14 +55,14 @@ def test_the_committed_figures_keep_the_bound() -> None:
     results = load(FIGURES)
     assert results
     for result in results:
-        together = result.details["front"]
-        points = {point["value"]: point for point in together["points"]}
+        tables = plots.tables(result)
+        points = plots.points(next(frame for title, frame in tables.items() if title.startswith(plots.COMBINATIONS)))
         seconds = []
         for level in LEVELS:
-            name = describe(setting_of(quality.settings(level)))
-            assert together["qualities"][level] == name, "measure again: `vestcl bench pareto`"
-            assert points[name]["loss"] <= LOSS[level]
-            seconds.append(points[name]["seconds"]["median"])
+            (name,) = points.index[points["is"].str.contains(level)]
+            assert name == describe(setting_of(quality.settings(level))), "measure again: `vestcl bench pareto`"
+            assert points["loss"][name] <= LOSS[level]
+            seconds.append(points["time"][name])
         assert seconds == sorted(seconds, reverse=True)
 
 

@@ -15,7 +15,7 @@ import tyro
 from rich.text import Text
 
 from vestcl.bench.common import results as _results
-from vestcl.bench.common.results import X_COPY, Measure, Results
+from vestcl.bench.common.results import X_COPY, Results
 from vestcl.bench.common.table import SHOWN, show_grid
 from vestcl.evaluation.tables import Grid, to_markdown
 from vestcl.io import atomic
@@ -58,7 +58,7 @@ def main(config: CompareBench) -> int:
     for before, after in pairs(_results.load(config.before), _results.load(config.after)):
         for warning in warnings(before, after):
             console.print(Text(f"warning: {warning}", "yellow"), soft_wrap=True)
-        changes = compare(before.measures, after.measures)
+        changes = compare(before.figures, after.figures)
         grids.append(_grid(before, after, changes))
         show_grid(grids[-1], console)
         if config.fail_above is not None:
@@ -84,13 +84,16 @@ def pairs(before: Sequence[Results], after: Sequence[Results]) -> list[tuple[Res
     benches = list(dict.fromkeys(result.bench for result in (*before, *after)))
     if len(benches) != 1:
         raise ValueError(f"`before` and `after` must be of the same benchmark, got {' and '.join(benches) or 'none'}")
-    if len(before) == len(after) == 1:
-        return [(before[0], after[0])]
-    found = [(one, two) for one in before for two in after if one.machine.get("device") == two.machine.get("device")]
+    alike = len(before) == len(after) == 1
+    found = [(one, two) for one in before for two in after if alike or _device(one) == _device(two)]
     if not found:
-        devices = (", ".join(str(result.machine.get("device")) for result in run) for run in (before, after))
+        devices = (", ".join(map(_device, run)) for run in (before, after))
         raise ValueError(f"`before` and `after` must have a device in common, got {' and '.join(devices)}")
     return found
+
+
+def _device(result: Results) -> str:
+    return result.machine.get("device", "unknown device")
 
 
 def warnings(before: Results, after: Results) -> Iterator[str]:
@@ -100,14 +103,18 @@ def warnings(before: Results, after: Results) -> Iterator[str]:
         for name in dict.fromkeys((*one, *two)):
             if name not in ignored and one.get(name) != two.get(name):
                 yield f"{name} differs: {one.get(name)} before, {two.get(name)} after"
-    names_of = [{measure.name for measure in result.measures} for result in (before, after)]
+    names_of = [{*result.figures["name"]} for result in (before, after)]
     for when, names in (("before", names_of[0] - names_of[1]), ("after", names_of[1] - names_of[0])):
         if names:
             yield f"only {when}: {', '.join(sorted(names))}"
 
 
-def compare(before: Sequence[Measure], after: Sequence[Measure]) -> pd.DataFrame:
-    """Every measure that both have, in the order of ``before``, a row each.
+def compare(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
+    """Every figure that both have, in the order of ``before``, a row each.
+
+    Args:
+        before: figures of the first run: "name", "unit", "better", "median", "low", "high".
+        after: of the second one.
 
     Returns:
         "name", "unit"; "median", "low" and "high" of both, as "median_before" and so on; "percent",
@@ -116,11 +123,9 @@ def compare(before: Sequence[Measure], after: Sequence[Measure]) -> pd.DataFrame
         did not change; "better" or "worse".
 
     Raises:
-        ValueError: a measure in different units.
+        ValueError: a figure in different units.
     """
-    columns = list(Measure.__dataclass_fields__)
-    runs = (pd.DataFrame([vars(measure) for measure in measures], columns=columns) for measures in (before, after))
-    both = pd.merge(*runs, on="name", suffixes=("_before", ""))
+    both = pd.merge(before, after, on="name", suffixes=("_before", ""))
     for one in both[both["unit"] != both["unit_before"]].itertuples():
         raise ValueError(f"`after` must have {one.name} in {one.unit_before!r}, got {one.unit!r}")
     moved = (both["low"] > both["high_before"]).astype(int) - (both["high"] < both["low_before"]).astype(int)
@@ -139,7 +144,7 @@ def _grid(before: Results, after: Results, changes: pd.DataFrame) -> Grid:
         ranges = (_range(change, when) for when in ("before", "after"))
         unit = _UNITS.get(change["unit"], change["unit"])
         rows.append((change["name"], change["verdict"], f"{change['percent']:+.1f}", unit, *ranges))
-    names = (result.machine.get("device", "unknown device") for result in (before, after))
+    names = map(_device, (before, after))
     dates = " -> ".join(result.machine.get("date", "?") for result in (before, after))
     title = f"vestcl bench {after.bench}, {' -> '.join(dict.fromkeys(names))}, {dates}"
     notes = (

@@ -7,13 +7,14 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Final, get_args
 
 import numpy as np
+import pandas as pd  # type: ignore[import-untyped]
 from rich.console import Console
 from rich.text import Text
 
@@ -21,8 +22,8 @@ from vestcl import doctor, opencl
 from vestcl._version import __version__
 from vestcl.bench.common import plots
 from vestcl.bench.common.options import Options
-from vestcl.bench.common.table import Better, Section, long_table, show_grid
-from vestcl.bench.common.timing import Spread, torch_threads
+from vestcl.bench.common.table import AGAIN, Better, Section, show_grid
+from vestcl.bench.common.timing import busy_cores, is_quiet, torch_threads
 from vestcl.evaluation.tables import Grid, finite, to_markdown
 from vestcl.io import atomic
 from vestcl.opencl import trace
@@ -39,6 +40,11 @@ WIDTH: Final = 80
 
 #: Of the files: the value of "vestcl".
 _FORMAT: Final = 1
+
+#: Of long tables; those that files of earlier versions lack have a value here.
+_ABSENT: Final = {"table": "", "row": "", "column": "", "text": "", "runs": 1}
+_REQUIRED: Final = ("median", "low", "high", "name", "unit", "better")
+COLUMNS: Final = (*_ABSENT, *_REQUIRED)
 
 _PACKAGES: Final = ("torch", "numpy", "pyopencl", "pocl-binary-distribution")
 
@@ -59,30 +65,6 @@ def settings(config: Any) -> dict[str, Any]:
     return dict(plain(dataclasses.asdict(config)))
 
 
-# ---------------------------------------------------------------- results
-
-
-@dataclass(frozen=True)
-class Measure:
-    """One figure that JSON keeps and `vestcl bench compare` compares: median and quartiles over its runs."""
-
-    name: str
-    """Unique in its `Results`, and the same from run to run."""
-    unit: str
-    """ "s", "B", "dB", "1" (a ratio, a relative error), ..."""
-    median: float
-    low: float
-    """First quartile."""
-    high: float
-    """Third quartile."""
-    better: Better = "lower"
-
-    @classmethod
-    def of(cls, name: str, unit: str, spread: Spread, better: Better = "lower") -> "Measure":
-        """The measure of several runs."""
-        return cls(name, unit, spread.median, spread.low, spread.high, better)
-
-
 @dataclass(frozen=True)
 class Results:
     """What a benchmark found out on one device."""
@@ -93,11 +75,17 @@ class Results:
     """What `describe` returns."""
     config: dict[str, Any]
     """What `settings` makes of the benchmark's configuration."""
-    measures: list[Measure]
-    grids: list[Grid]
+    frame: pd.DataFrame
+    """The long tables of all sections, `COLUMNS`."""
+    grids: list[Grid] = field(default_factory=list)
     """For the screen and Markdown; they are not in JSON."""
-    details: dict[str, Any]
-    """Whatever else is worth keeping; see `plain` for what it may hold."""
+    details: dict[str, Any] = field(default_factory=dict)
+    """What files of earlier versions have besides figures."""
+
+    @property
+    def figures(self) -> pd.DataFrame:
+        """The rows that have a name."""
+        return self.frame[self.frame["name"] != ""]
 
 
 def run(bench: str, config: Options, measure: Callable[[opencl.Session, Console], Iterator[Section]]) -> list[Results]:
@@ -106,48 +94,33 @@ def run(bench: str, config: Options, measure: Callable[[opencl.Session, Console]
     Raises:
         DeviceError: as `measure_each`.
     """
-    screen = console()
+    screen, results = console(), list[Results]()
 
     def measured(session: opencl.Session) -> Results:
         machine = describe(session)
-        show_machine(machine, screen)
-        sections = drawn(bench, session, config.plots, measure(session, screen))
-        return collect(bench, machine, settings(config), sections, screen)
-
-    with trace.record(config.trace), torch_threads(config.threads):
-        results = measure_each(config.device, measured, screen)
-    save(results, config.json, config.markdown)
-    tell_written(screen, config.json, config.markdown, config.trace, config.plots)
-    return results
-
-
-def drawn(bench: str, session: opencl.Session, folder: Path | None, sections: Iterable[Section]) -> Iterator[Section]:
-    """The sections, whose plots are drawn in ``folder``."""
-    for section in sections:
-        frame = long_table(row for row in section.rows if row.column)
-        wanted = [frame[frame["column"].isin(columns)] for columns in section.plots] + [frame] * section.stacked
-        for number, own in enumerate(wanted if folder else (), 1):
-            path = Path(folder or "") / plots.file_name(f"{bench} {section.title} {number} {session.info.index}")
-            plots.bars(path, f"{section.title}\n{device_name(session)}", own, section.stacked)
-        yield section
-
-
-def collect(
-    bench: str, machine: dict[str, str], config: dict[str, Any], sections: Iterable[Section], screen: Console
-) -> Results:
-    """The sections as `Results`, each printed as it comes: figures that have a name, tables, and details joined."""
-    measures, grids, details = list[Measure](), list[Grid](), dict[str, Any]()
-    for section in sections:
-        measures += [Measure.of(one.name, one.unit, one.spread, one.better) for one in section.rows if one.name]
-        if section.title:
+        for name, value in machine.items():
+            screen.print(f"{name}: {value}", soft_wrap=True, highlight=False, markup=False)
+        frames, grids, number = list[pd.DataFrame](), list[Grid](), f"{len(results)} " if results else ""
+        busy_cores.set(0.0)
+        for section in measure(session, screen):
+            if not is_quiet():
+                note = f"other processes kept {busy_cores.get():.1f} cores busy meanwhile: {AGAIN}"
+                section = replace(section, notes=(*section.notes, note))
+            busy_cores.set(0.0)
+            frames.append(section.frame)
             grids.append(section.grid())
             show_grid(grids[-1], screen)
-        for key, value in section.details.items():
-            details[key] = details[key] + value if isinstance(value, list) and key in details else value
-    return Results(bench, machine, config, measures, grids, dict(plain(details)))
+            for name, draw in section.plots.items() if config.plots else ():
+                figure = draw(frames[-1], f"{section.title}\n{machine['device']}")
+                plots.write(figure, Path(config.plots or "") / plots.file_name(number + name))
+        results.append(Results(bench, machine, settings(config), pd.concat(frames), grids))
+        return results[-1]
 
-
-# ---------------------------------------------------------------- devices
+    with trace.record(config.trace), torch_threads(config.threads):
+        found = measure_each(config.device, measured, screen)
+    save(found, config.json, config.markdown)
+    tell_written(screen, config.json, config.markdown, config.trace, config.plots)
+    return found
 
 
 def measure_each(selector: str | None, measure: Callable[[opencl.Session], Results], console: Console) -> list[Results]:
@@ -159,34 +132,30 @@ def measure_each(selector: str | None, measure: Callable[[opencl.Session], Resul
     Raises:
         DeviceError: no such device, or with "all" none that works.
     """
+    if selector != ALL:
+        with opencl.use(selector) as session:
+            return [measure(session)]
     results = []
-    for index in _usable(console) if selector == ALL else [selector]:
-        with opencl.use(index) as session:
+    with console.status("trying every OpenCL device"):
+        devices = doctor.examine().devices
+    if not any(device.works for device in devices):
+        raise opencl.DeviceError("no OpenCL device works: `vestcl doctor` tells why")
+    for device in devices:
+        reason = next(iter(device.notes), "does not work")
+        if device.works:
             try:
-                results.append(measure(session))
+                with opencl.use(device.info.index) as session:
+                    results.append(measure(session))
+                continue
             except Exception as error:  # drivers fail in many ways, and only runtime knows pyopencl's
-                if isinstance(error, ValueError) or selector != ALL:  # a mistake in the settings is no device's
+                if isinstance(error, ValueError):  # a mistake in the settings is no device's
                     raise
-                _report(console, session.info, f"{type(error).__name__}: {error}")
+                reason = f"{type(error).__name__}: {error}"
+        about = f"{device.info.index} {device.info.platform} / {device.info.name} left out: {reason}"
+        console.print(Text(about, "red"), soft_wrap=True)
     if not results:
         raise opencl.DeviceError("the benchmark failed on every device")
     return results
-
-
-def _usable(console: Console) -> list[str]:
-    with console.status("trying every OpenCL device"):
-        report = doctor.examine()
-    for device in report.devices:
-        if not device.works:
-            _report(console, device.info, next(iter(device.notes), "does not work"))
-    works = [device.info.index for device in report.devices if device.works]
-    if not works:
-        raise opencl.DeviceError("no OpenCL device works: `vestcl doctor` tells why")
-    return works
-
-
-def _report(console: Console, info: opencl.DeviceInfo, reason: str) -> None:
-    console.print(Text(f"{info.index} {info.platform} / {info.name} left out: {reason}", "red"), soft_wrap=True)
 
 
 def console(width: int | None = None) -> Console:
@@ -216,18 +185,13 @@ def describe(session: opencl.Session) -> dict[str, str]:
         **versions,
         "python": platform.python_version(),
         "system": platform.platform(),
-        "device": device_name(session),
+        "device": f"{session.info.index} {session.info.platform} / {session.info.name}",
         "driver": session.info.driver,
         "compute units": str(session.info.compute_units),
         "mapping": session.mapping,
         "processor": _processor(),
         "cores": str(os.cpu_count()),
     }
-
-
-def device_name(session: opencl.Session) -> str:
-    """ "0:0 PLATFORM / NAME"."""
-    return f"{session.info.index} {session.info.platform} / {session.info.name}"
 
 
 def _processor() -> str:
@@ -239,33 +203,21 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-# ---------------------------------------------------------------- screen and files
-
-
-def show_machine(machine: dict[str, str], console: Console) -> None:
-    """Print what the numbers depend on."""
-    for name, value in machine.items():
-        console.print(f"{name}: {value}", soft_wrap=True, highlight=False, markup=False)
-
-
 def save(results: Sequence[Results], json: Path | None, markdown: Path | None) -> None:
     """Write the results, each file whole or not at all.
 
     Args:
-        results: of one benchmark, a device each.
-        json: file {"vestcl": 1, "bench": ..., "devices": [{"machine", "config", "measures", "details"}]}, or None.
+        results: of one benchmark, a device each, one or more.
+        json: file {"vestcl": 1, "bench": ..., "devices": [{"machine", "config", "measures": [a row each]}]}, or None.
         markdown: file with machine and tables of each device, or None.
 
     Raises:
-        ValueError: nothing to save, results of several benchmarks, a value that `plain` refuses, a folder that can't be
-            made.
+        ValueError: a value that `plain` refuses, a folder that can't be made.
     """
-    benches = {result.bench for result in results}
-    if len(benches) != 1:
-        raise ValueError(f"`results` must be of one bench, got {', '.join(sorted(benches)) or 'none'}")
     if json is not None:
-        kept = ("machine", "config", "measures", "details")
-        devices = [{name: getattr(result, name) for name in kept} for result in results]
+        devices = [
+            {"machine": one.machine, "config": one.config, "measures": one.frame.to_dict("records")} for one in results
+        ]
         write_json(json, plain({"vestcl": _FORMAT, "bench": results[0].bench, "devices": devices}))
     if markdown is not None:
         atomic.write_bytes(markdown, "\n".join(map(_to_markdown, results)).encode())
@@ -326,13 +278,11 @@ def _to_markdown(result: Results) -> str:
 
 
 def _device(bench: str, device: dict[str, Any]) -> Results:
-    measures = [_measure(measure) for measure in device["measures"]]
-    return Results(str(bench), dict(device["machine"]), dict(device["config"]), measures, [], dict(device["details"]))
-
-
-def _measure(content: dict[str, Any]) -> Measure:
-    numbers = (content[key] for key in ("median", "low", "high"))
-    median, low, high = (float("nan") if number is None else float(number) for number in numbers)
-    if content["better"] not in get_args(Better):
-        raise TypeError(f'"better": {content["better"]!r}')
-    return Measure(content["name"], content["unit"], median, low, high, content["better"])
+    """Of a file; those of earlier versions have figures only, which are in no table."""
+    rows = [_ABSENT | {key: measure[key] for key in _REQUIRED} | measure for measure in device["measures"]]
+    for row in rows:
+        row |= {key: float("nan" if row[key] is None else row[key]) for key in ("median", "low", "high")}
+        if row["better"] not in get_args(Better):
+            raise TypeError(f'"better": {row["better"]!r}')
+    frame = pd.DataFrame(rows, columns=COLUMNS)
+    return Results(str(bench), dict(device["machine"]), dict(device["config"]), frame, [], device.get("details", {}))

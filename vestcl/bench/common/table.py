@@ -1,19 +1,18 @@
 """The long table of a benchmark, a row per measurement, and all that is pivoted from it: tables, figures, plots.
 
     rows = [
-        Measurement("forward", "ms", spread, "s", name="splat forward"),   # a figure, in JSON as "splat forward"
+        Measurement("forward", "ms", spread, "s", name="splat forward"),   # a figure, for `vestcl bench compare`
         Measurement("forward", "target", "<= 4 reached"),                  # a text
     ]
-    frame = long_table(rows)             # a pandas DataFrame
-    grid = pivot(frame, title, notes)    # rows by columns, as text
-    show_grid(grid, console)             # a table, or several below each other where it is too wide
+    section = Section("splat", rows)
+    show_grid(section.grid(), console)   # rows by columns; below each other where a table is too wide
 
-A bench yields `Section`s: title, rows, notes and details. `vestcl.bench.common.results.run` prints and saves them.
+A bench yields `Section`s, which `vestcl.bench.common.results.run` prints, plots and saves.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import pandas as pd  # type: ignore[import-untyped]
 from rich import box
@@ -24,6 +23,9 @@ from rich.text import Text
 from vestcl.bench.common.timing import Spread, is_quiet
 from vestcl.evaluation.tables import Grid
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Better = Literal["lower", "higher"]
 
 #: Unit -> factor to what tables show: milliseconds, megabytes.
@@ -32,7 +34,8 @@ SHOWN: Final = {"s": 1e3, "B": 1e-6}
 #: What a cell may end with, and its colour on the screen.
 _VERDICTS: Final = {"reached": "green", "missed": "red", "can't tell": "yellow", "better": "green", "worse": "red"}
 
-_AGAIN: Final = "measure again"
+#: End of a note where other processes disturbed what a table shows.
+AGAIN: Final = "measure again"
 
 #: Columns of the screen around a cell.
 _AROUND: Final = 2
@@ -58,7 +61,7 @@ class Measurement:
     digits: str = ""
     """Format of the median; without it three digits or so, and the quartiles."""
     name: str = ""
-    """In JSON, unique in a benchmark's results; "" keeps the figure out of it."""
+    """Of a figure that `vestcl bench compare` compares, unique in a benchmark's results; "" for others."""
     better: Better = "lower"
 
     @property
@@ -92,50 +95,34 @@ class Section:
     """What one part of a bench found."""
 
     title: str
-    """Of its table; "" prints none."""
-    rows: list[Measurement]
+    rows: Sequence[Measurement]
     notes: tuple[str, ...] = ()
-    details: dict[str, Any] = field(default_factory=dict)
-    """For JSON, see `vestcl.bench.common.results.plain`; lists of several sections under one key become one list."""
-    plots: tuple[tuple[str, ...], ...] = ()
-    """The columns, in seconds, of each plot: `vestcl.bench.common.plots.bars`."""
-    stacked: bool = False
-    """Whether there is a plot of all columns with stacked bars."""
+    plots: Mapping[str, Callable[[pd.DataFrame, str], "Figure"]] = field(default_factory=dict)
+    """By the name of the file: what draws the long table below a title."""
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """The long table: table, row, column, text, name, unit, better, median, low, high, runs."""
+        kept = ("row", "column", "text", "name", "unit", "better")
+        rows = [{name: getattr(one, name) for name in kept} | vars(one.spread) for one in self.rows]
+        return pd.DataFrame([{"table": self.title} | row for row in rows])
 
     def grid(self) -> Grid:
-        """Rows by columns."""
-        return pivot(long_table(row for row in self.rows if row.column), self.title, self.notes)
+        """Rows by columns, both in the order of their first cells; empty where there is none.
+
+        Raises:
+            ValueError: two measurements in one cell.
+        """
+        frame = self.frame[self.frame["column"] != ""]
+        wide = frame.pivot(index="row", columns="column", values="text")
+        wide = wide.reindex(index=frame["row"].unique(), columns=frame["column"].unique()).fillna("")
+        rows = tuple((str(label), *map(str, cells)) for label, cells in zip(wide.index, wide.to_numpy(), strict=True))
+        return Grid(self.title, ("", *map(str, wide.columns)), rows, self.notes)
 
 
-def long_table(rows: Iterable[Measurement]) -> pd.DataFrame:
-    """The rows as a DataFrame: row, column, text, name, unit, median, low, high, runs, better."""
-    kept = ("row", "column", "text", "name", "unit", "better")
-    return pd.DataFrame([{name: getattr(one, name) for name in kept} | vars(one.spread) for one in rows])
-
-
-def pivot(frame: pd.DataFrame, title: str, notes: tuple[str, ...] = ()) -> Grid:
-    """Rows by columns, both in the order of their first cells; empty where there is none.
-
-    Raises:
-        ValueError: two measurements in one cell.
-    """
-    wide = frame.pivot(index="row", columns="column", values="text")
-    wide = wide.reindex(index=frame["row"].unique(), columns=frame["column"].unique()).fillna("")
-    rows = tuple((str(label), *map(str, cells)) for label, cells in zip(wide.index, wide.to_numpy(), strict=True))
-    return Grid(title, ("", *map(str, wide.columns)), rows, notes)
-
-
-def busy(*others_cores: float | None) -> tuple[str, ...]:
-    """A note where other processes disturbed what a table shows."""
-    busiest = max((cores or 0.0 for cores in others_cores), default=0.0)
-    if is_quiet(busiest):
-        return ()
-    return (f"other processes kept {busiest:.1f} cores busy meanwhile: {_AGAIN}",)
-
-
-def verdict(reached: bool, others_cores: float | None = None) -> str:
-    """What became of a target; a busy machine proves no target missed."""
-    return "reached" if reached else "missed" if is_quiet(others_cores) else "can't tell"
+def verdict(reached: bool, timed: bool = True) -> str:
+    """What became of a target; a busy machine proves no target of times missed."""
+    return "reached" if reached else "missed" if not timed or is_quiet() else "can't tell"
 
 
 def show_grid(grid: Grid, console: Console) -> None:
@@ -149,7 +136,7 @@ def show_grid(grid: Grid, console: Console) -> None:
             table.add_row(*map(_coloured, row))
         console.print(table)
     for note in grid.notes:
-        console.print(Text(f"  {note}", "red" if note.endswith(_AGAIN) else "dim"))
+        console.print(Text(f"  {note}", "red" if note.endswith(AGAIN) else "dim"))
     console.print()
 
 

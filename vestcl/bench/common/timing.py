@@ -9,9 +9,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -31,6 +32,9 @@ PAUSE: Final = 0.01
 
 #: The share of the machine that other processes may keep busy before no target counts as reached or missed.
 QUIET_SHARE: Final = 0.05
+
+#: Cores that other processes kept busy during measurements, the most since it was set to 0.
+busy_cores: Final = ContextVar("busy_cores", default=0.0)
 
 
 @dataclass(frozen=True)
@@ -72,16 +76,17 @@ def interleave(tasks: Mapping[str, Task], seconds: float, least: int = LEAST_ROU
     gc.collect()
     gc.disable()
     try:
-        for number in range(MOST_ROUNDS):
-            if number >= least and time.perf_counter() > end:
-                break
-            shuffle(order)
-            for name, task in order:
-                time.sleep(PAUSE)
-                start = time.perf_counter()
-                result = task()
-                times[name].append(time.perf_counter() - start)
-                del result
+        with watching_others():
+            for number in range(MOST_ROUNDS):
+                if number >= least and time.perf_counter() > end:
+                    break
+                shuffle(order)
+                for name, task in order:
+                    time.sleep(PAUSE)
+                    start = time.perf_counter()
+                    result = task()
+                    times[name].append(time.perf_counter() - start)
+                    del result
     finally:
         if collects:
             gc.enable()
@@ -117,53 +122,27 @@ def peak_gigabytes() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * units / 1e9
 
 
-def copies_of_forward(features: torch.Tensor, threads: int) -> dict[str, Task]:
-    """Features in, image out: ways to copy the features to memory that is there already, by name."""
-    to = torch.empty_like(features)
-    pairs, pool = _shares(threads, to, features), ThreadPoolExecutor(threads)
-    return {
-        "torch copy_": lambda: to.copy_(features),
-        "numpy copyto": lambda: list(pool.map(lambda pair: np.copyto(*pair), pairs)),
-    }
-
-
-def copies_of_backward(features: torch.Tensor, threads: int) -> dict[str, Task]:
-    """Features and the image's gradient in, the features' gradient out: ways to add two arrays into a third."""
-    grad, to = torch.ones_like(features), torch.empty_like(features)
-    triples, pool = _shares(threads, features, grad, to), ThreadPoolExecutor(threads)
-    return {
-        "torch add": lambda: torch.add(features, grad, out=to),
-        "numpy add": lambda: list(pool.map(lambda abc: np.add(abc[0], abc[1], out=abc[2]), triples)),
-    }
-
-
-def _shares(threads: int, *tensors: torch.Tensor) -> list[tuple[NDArray[Any], ...]]:
-    """The tensors' memory, one equal share a thread."""
-    return list(zip(*(np.array_split(tensor.numpy().reshape(-1), threads) for tensor in tensors), strict=True))
-
-
-@dataclass
-class Others:
-    """What `watching_others` saw."""
-
-    cores: float | None = None
-    """Cores that other processes kept busy; None where /proc does not say."""
+def memcpy(threads: int, *sources: torch.Tensor) -> Task:
+    """Copy one array, or add two, into memory that is there already, a share a thread: what moving the bytes takes."""
+    to, pool = torch.empty_like(sources[0]), ThreadPoolExecutor(threads)
+    shares = zip(*(np.array_split(of.numpy().reshape(-1), threads) for of in (to, *sources)), strict=True)
+    pairs, operation = list(shares), np.positive if len(sources) == 1 else np.add
+    return lambda: list(pool.map(lambda pair: operation(*pair[1:], out=pair[0]), pairs))  # type: ignore[call-overload]
 
 
 @contextlib.contextmanager
-def watching_others() -> Iterator[Others]:
-    """Measure, until the ``with`` block ends, how busy other processes keep the machine."""
-    others = Others()
+def watching_others() -> Iterator[None]:
+    """Measure, until the ``with`` block ends, how many cores other processes keep busy, for `busy_cores`."""
     start, before = time.perf_counter(), _others_seconds()
-    yield others
+    yield
     after, seconds = _others_seconds(), time.perf_counter() - start
     if before is not None and after is not None:
-        others.cores = max(0.0, (after - before) / seconds)
+        busy_cores.set(max(busy_cores.get(), (after - before) / seconds))
 
 
-def is_quiet(others_cores: float | None) -> bool:
+def is_quiet() -> bool:
     """Whether so busy a machine still gives honest ratios: threads that wait for each other suffer more than others."""
-    return others_cores is None or others_cores <= QUIET_SHARE * (os.cpu_count() or 1)
+    return busy_cores.get() <= QUIET_SHARE * (os.cpu_count() or 1)
 
 
 def _others_seconds() -> float | None:

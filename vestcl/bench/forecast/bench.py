@@ -12,9 +12,8 @@ from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.table import Measurement, Section, show_grid
 from vestcl.bench.forecast.config import HELD_OUT, ForecastBench, check
-from vestcl.bench.forecast.kept import Facts
 from vestcl.bench.forecast.run import Networks, kept_windows, run
-from vestcl.bench.forecast.windows import Group, groups_of
+from vestcl.bench.forecast.windows import Facts, Group, groups_of
 from vestcl.evaluation import tables
 from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.regions import REGIONS

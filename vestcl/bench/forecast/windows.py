@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Final, Literal
 
 from vestcl.bench.forecast.config import HELD_OUT, ForecastBench
-from vestcl.bench.forecast.kept import Facts
 from vestcl.cli.checks import check_input
 from vestcl.cli.clip import load_estimators, with_estimates
 from vestcl.data.open import open_sequence
@@ -30,6 +29,18 @@ class Listed:
     """Whether constants were chosen on it, or it only checks them."""
     frames: tuple[int, ...]
     """The current frame t of each window, from 0."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Errors of one window's forecast other than in images."""
+
+    clip: str
+    frame: str
+    index: int
+    """Of the current frame t in the clip."""
+    values: dict[str, list[float]]
+    """By what is measured, a number a step."""
 
 
 @dataclass

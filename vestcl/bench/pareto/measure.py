@@ -12,12 +12,11 @@ import torch
 
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.timing import Spread
-from vestcl.bench.pareto.knobs import EXACT, Setting, describe
+from vestcl.bench.pareto.knobs import EXACT, Setting, options_of
 from vestcl.bench.pareto.scenes import Scene, double, shrunk
 from vestcl.evaluation import metrics
 from vestcl.forecasting.network.input import NetworkInput
 from vestcl.models.forecaster import Forecaster, Mode
-from vestcl.models.inference.options import InferenceOptions
 from vestcl.models.inference.resolution import enlarged
 from vestcl.models.steps.memory import EncodedFrames
 
@@ -34,8 +33,6 @@ class Point:
 
     value: str
     """Of the knob, or a description of several."""
-    setting: dict[str, Any]
-    """What differs from the defaults."""
     seconds: Spread
     """Of one forecast step, mean over the streets."""
     rms: Spread
@@ -77,11 +74,6 @@ def step(model: Forecaster, given: NetworkInput, steps: int = 1, mode: Mode | No
     return done[-1].views[0].image
 
 
-def apply(model: Forecaster, setting: Setting) -> None:
-    """Set the switches of ``setting``; its size is that of the input."""
-    model.options = InferenceOptions.from_dict(setting)
-
-
 def measure(bench: Bench, settings: Mapping[str, Setting]) -> list[Point]:
     """Each setting's time and error; the exact one is the first of the points, whether it is in ``settings`` or not.
 
@@ -108,7 +100,7 @@ def measure(bench: Bench, settings: Mapping[str, Setting]) -> list[Point]:
         ms_ssim = _compared(bench, metrics.ms_ssim, images[name]) if large else [float("nan")] * len(psnr[name])
         errors, psnrs, ms_ssims = (Spread.of(np.array(values)) for values in (rms, psnr[name], ms_ssim))
         time, loss = Spread.of(seconds[name] / len(bench.scenes)), sum(losses) / len(losses)
-        points.append(Point(name, settings[name], time, errors, psnrs, ms_ssims, loss, max(losses)))
+        points.append(Point(name, time, errors, psnrs, ms_ssims, loss, max(losses)))
     return points
 
 
@@ -117,7 +109,7 @@ def _task(bench: Bench, setting: Setting, keep: Callable[[Images], None]) -> Cal
     memories = [_memory(bench, setting, index, given) for index, given in enumerate(inputs)]
 
     def task() -> None:
-        apply(bench.model, setting)
+        bench.model.options = options_of(setting)
         done = []
         for scene, given, memory in zip(bench.scenes, inputs, memories, strict=True):
             bench.model.memory = memory.copy()
@@ -129,10 +121,10 @@ def _task(bench: Bench, setting: Setting, keep: Callable[[Images], None]) -> Cal
 
 def _memory(bench: Bench, setting: Setting, index: int, given: NetworkInput) -> EncodedFrames:
     """The model's memory when it has seen the frame at t - 1."""
-    key = index, describe({name: value for name, value in setting.items() if name != "effort"})
+    key = index, options_of(setting).of_encoder, setting.get("size"), setting.get("seen")
     if key not in bench.memories:
         bench.model.memory = EncodedFrames()
-        apply(bench.model, setting)
+        bench.model.options = options_of(setting)
         with torch.no_grad():
             bench.model.encode(given.frame_prev)
         bench.memories[key] = bench.model.memory
@@ -146,13 +138,13 @@ def _compared(bench: Bench, metric: Callable[..., torch.Tensor], images: Images,
     return [float(metric(metrics.quantise(image), metrics.quantise(truth))) for image, truth in pairs]
 
 
-def recursions(bench: Bench, horizons: Sequence[int]) -> list[dict[str, Any]]:
+def recursions(bench: Bench, horizons: Sequence[int]) -> list[tuple[Mode, int, Spread, Spread]]:
     """Both ways to forecast several steps, timed in turns.
 
     Returns:
         For each of ``horizons`` and modes ("compose" repeats the first step's motion, "feedback" sees each forecast
-        frame): "mode", "steps", "seconds" of the whole forecast with the preprocessing of forecast frames, and "psnr"
-        over streets, dB.
+        frame): mode, steps, seconds of the whole forecast with the preprocessing of forecast frames, and PSNR over
+        streets, dB.
     """
     images: dict[tuple[Mode, int], Images] = {}
     modes: tuple[Mode, ...] = ("compose", "feedback")
@@ -164,14 +156,13 @@ def recursions(bench: Bench, horizons: Sequence[int]) -> list[dict[str, Any]]:
             bench.model.memory = EncodedFrames()
             images[key].append(step(bench.model, scene.given, key[1], key[0]).clamp(0, 1))
 
-    apply(bench.model, EXACT)
+    bench.model.options = options_of(EXACT)
     seconds = _timing.interleave({name: partial(run, key) for name, key in keys.items()}, 0.0, bench.runs)
-    found = []
-    for name, (mode, steps) in keys.items():
-        psnr = Spread.of(np.array(_compared(bench, metrics.psnr, images[mode, steps], steps)))
-        time = Spread.of(seconds[name] / len(bench.scenes))
-        found.append({"mode": mode, "steps": steps, "seconds": time, "psnr": psnr})
-    return found
+    psnr = {key: _compared(bench, metrics.psnr, images[key], key[1]) for key in keys.values()}
+    return [
+        (*key, Spread.of(seconds[name] / len(bench.scenes)), Spread.of(np.array(psnr[key])))
+        for name, key in keys.items()
+    ]
 
 
 def front(points: Sequence[Point]) -> list[Point]:

@@ -1,6 +1,6 @@
 """`vestcl bench pipeline`: a complete forecast step in empty streets and full ones, and what skipping saves of it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, Literal
@@ -10,10 +10,11 @@ from rich.console import Console
 from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.options import Options
+from vestcl.bench.common.plots import bars
 from vestcl.bench.common.results import X_COPY
-from vestcl.bench.common.table import Measurement, Section, busy
-from vestcl.bench.common.timing import peak_gigabytes
-from vestcl.bench.pipeline.measure import ALL, COPY, INPAINT, NONE, PEER, Record, measure_scene
+from vestcl.bench.common.table import Measurement, Section, verdict
+from vestcl.bench.common.timing import Spread
+from vestcl.bench.pipeline.measure import ALL, COPY, INPAINT, NONE, PEER, Measured, measure_scene
 from vestcl.bench.pipeline.traffic import EMPTY, EVERYTHING, JAM, LEAST_FRAMES, TRAFFIC, drive
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference import quality
@@ -100,123 +101,81 @@ def _check(config: PipelineBench) -> None:
 
 
 def _sections(config: PipelineBench, model: Forecaster, _: opencl.Session, console: Console) -> Iterator[Section]:
-    """All scenes on one device, as they come."""
-    size, scenes = f"{config.height}x{config.width}", []
+    """All scenes on one device, as they come, and tables of all of them."""
+    targets, stages = list[Measurement](), list[Measurement]()
     for name in dict.fromkeys(config.scenes):
         with console.status(name), trace.stage(name):
             scene = drive(name, config.height, config.width, config.frames, config.seed)
-            scenes.append(measure_scene(model, scene, config.seconds, config.threads, config.peers))
-        yield scene_section(scenes[-1], f"{model.config.name}, {size}")
-    yield from sections(scenes)
-    counts = {
-        scene["name"]: {key: count._asdict() for key, count in (scene["counts"] | scene["splatter"]).items()}
-        for scene in scenes
-    }
-    about = model.options.as_dict()
-    about |= {"scenes": {scene["name"]: scene for scene in scenes}, "counts": counts}
-    yield Section("", [], details=about | {"peak_gigabytes": peak_gigabytes()})
+            one = measure_scene(model, scene, config.seconds, config.threads, config.peers)
+        size = f"{model.config.name}, {config.height}x{config.width}"
+        title = f"forecast step, {name} ({one.foreground:.0%} foreground), {size}"
+        notes = (
+            f"{INPAINT}: a new frame's background, before the step. {COPY}: of both frames' layers.",
+            f"{len(one.times[NONE])} rounds.",
+        )
+        targets += _target_rows(one)
+        yield Section(title, list(_scene_rows(one)), notes)
+        stages += _stage_rows(one)
+    plot = partial(bars, stacked=True)
+    yield Section("stages with nothing and with all skipped, ms", stages, ("Medians.",), {"pipeline": plot})
+    yield Section("targets", targets, ("PSNR: means over the drives' steps; inf: the same.",))
 
 
-# ---------------------------------------------------------------- targets and tables
+def _scene_rows(scene: Measured) -> Iterator[Measurement]:
+    """A variant each: its time, what that saves in the same round, and what is skipped."""
+    for name, times in scene.times.items():
+        figure = f"{scene.name}: {name}"
+        yield Measurement(name, "ms (quartiles)", Spread.of(times), "s", name=figure)
+        if name in scene.stages and name != NONE:
+            share = Spread.of(1 - times / scene.times[NONE])
+            yield Measurement(name, "saved", share, "1", "+.1%", f"{figure}: saved", "higher")
+        if name in scene.counts:
+            yield Measurement(name, "skipped", counted(scene.counts[name]))
 
 
-def verdicts(scene: Record) -> Iterator[dict[str, object]]:
-    """Every target that a scene has figures for. "quiet": whether a missed one proves anything."""
-    name, cores, saved = scene["name"], scene["others_cores"], scene["saved_share"][ALL].median
-    loss = _loss(scene)
-    found: list[tuple[str, str, str, bool]] = []
-    if name in OF_PEER and scene["of_peer"] is not None:
-        ratio, most = scene["of_peer"].median, OF_PEER[name]
-        found.append((f"step / {PEER}", f"<= {most:g}", f"{ratio:.2f}", ratio <= most))
+def _stage_rows(scene: Measured) -> Iterator[Measurement]:
+    for variant in (NONE, ALL):
+        column = f"{scene.name}, {'nothing' if variant == NONE else 'all'}"
+        for stage, spread in scene.stages[variant].items():
+            yield Measurement(stage, column, spread, "s", ".1f", f"{scene.name}: {variant}: {stage}")
+    if PEER in scene.times:
+        yield Measurement(PEER, f"{scene.name}, {PEER}", Spread.of(scene.times[PEER]), "s", ".1f")
+
+
+def _target_rows(scene: Measured) -> Iterator[Measurement]:
+    """The step with all skipped against the peer and a copy, what skipping saves, and what it changes."""
+    name, step = scene.name, scene.times[ALL]
+    of_peer = Spread.of(step / scene.times[PEER]) if PEER in scene.times else None
+    saved = Spread.of(1 - step / scene.times[NONE])
+    loss = None if scene.truth is None else scene.truth[0] - scene.truth[1]
+    if of_peer is not None:
+        yield Measurement(name, f"of {PEER}'s", of_peer, digits=".2f", name=f"{name}: {ALL}, x {PEER}")
+    yield Measurement(name, "x copy", Spread.of(step / scene.times[COPY]), digits=".0f", name=f"{name}: {ALL}{X_COPY}")
+    yield Measurement(name, "saved", saved, digits=".1%")
+    yield Measurement(name, "PSNR against nothing skipped", scene.against_nothing, "dB", ".2f")
+    if scene.truth is not None:
+        known = scene.truth[1]
+        yield Measurement(name, "PSNR, all skipped", known, "dB", ".2f", f"{name}: {ALL} against truth", "higher")
+    if loss is not None:
+        yield Measurement(name, "PSNR drop", loss, "dB", ".2f", f"{name}: lost")
+    ratio = None if of_peer is None else of_peer.median
+    for what, text in verdicts(name, ratio, saved.median, loss).items():
+        yield Measurement(name, what, text)
+
+
+def verdicts(name: str, of_peer: float | None, saved: float, loss: float | None) -> dict[str, str]:
+    """Every target that a scene has figures for: what, and "<= 0.5 reached"."""
+    found = {}
+    if name in OF_PEER and of_peer is not None:
+        most = OF_PEER[name]
+        found[f"target of {PEER}'s"] = f"<= {most:g} {verdict(of_peer <= most)}"
     if name in SAVED:
-        found.append(("skipping saves", f">= {SAVED[name]:.0%}", f"{saved:.0%}", saved >= SAVED[name]))
+        found["target saved"] = f">= {SAVED[name]:.0%} {verdict(saved >= SAVED[name])}"
     if name == EVERYTHING:
-        found.append(("skipping costs", f"<= {MOST_COST:.0%}", f"{-saved:.1%}", -saved <= MOST_COST))
+        found["target saved"] = f">= {-MOST_COST:.0%} {verdict(-saved <= MOST_COST)}"
     if loss is not None:
-        found.append(("dB PSNR lost", f"<= {MOST_LOSS:g}", f"{loss:.3f}", loss <= MOST_LOSS))
-    for what, wanted, got, reached in found:
-        quiet = what == "dB PSNR lost" or not busy(cores)
-        yield {"what": f"{name}: {what}", "wanted": wanted, "got": got, "reached": reached, "quiet": quiet}
-
-
-def word(target: dict[str, object]) -> str:
-    """What became of it."""
-    return "reached" if target["reached"] else "missed" if target["quiet"] else "can't tell"
-
-
-def _loss(scene: Record) -> float | None:
-    """dB that skipping costs against the truth."""
-    truths = scene["pictures"]["truth_nothing"], scene["pictures"]["truth_all"]
-    return None if None in truths else truths[0] - truths[1]
-
-
-def scene_section(scene: Record, size: str) -> Section:
-    """Times and counters of one scene; ``size`` of the images, for the title."""
-    notes = [
-        f"{INPAINT}: a new frame's background, before the step. {COPY}: of both frames' layers.",
-        f"{scene['seconds'][NONE].runs} rounds.",
-    ]
-    if scene["of_peer"] is not None:
-        notes.append(f"The step with all skipped takes {scene['of_peer'].median:.2f} of {PEER}'s time.")
-    notes.append(f"The step with all skipped takes {scene['of_copy'].median:.0f} copies of both frames' layers.")
-    title = f"forecast step, {scene['name']} ({scene['foreground']:.0%} foreground), {size}"
-    return Section(title, list(_scene_rows(scene)), (*notes, *busy(scene["others_cores"])))
-
-
-def _scene_rows(scene: Record) -> Iterator[Measurement]:
-    prefix = f"{scene['name']}: "
-    for name, spread in scene["seconds"].items():
-        yield Measurement(name, "ms (quartiles)", spread, "s", name=prefix + name)
-        if name in scene["saved"]:
-            share = scene["saved_share"][name]
-            yield Measurement(name, "saved, ms", scene["saved"][name], "s", "+.1f")
-            yield Measurement(name, "saved", share, "1", "+.1%", f"{prefix}{name}: saved", "higher")
-        if name.removesuffix(" alone") in scene["counts"]:
-            yield Measurement(name, "skipped", counted(scene["counts"][name.removesuffix(" alone")]))
-    yield Measurement(ALL, "", scene["of_copy"], name=f"{prefix}{ALL}{X_COPY}")
-    if scene["of_peer"] is not None:
-        yield Measurement(ALL, "", scene["of_peer"], name=f"{prefix}{ALL}, x {PEER}")
-
-
-def sections(scenes: Sequence[Record]) -> Iterator[Section]:
-    """Tables of all scenes together: stages, images, splatter, targets."""
-    stages = [
-        Measurement(stage, f"{one['name']}, {'nothing' if variant == NONE else 'all'}", spread, "s", ".1f", name)
-        for one in scenes
-        for variant in (NONE, ALL)
-        for stage, spread in one["stages"][variant].items()
-        for name in [f"{one['name']}: {variant}: {stage}"]
-    ]
-    stages += [
-        Measurement(PEER, f"{one['name']}, {PEER}", one["seconds"][PEER], "s", ".1f")
-        for one in scenes
-        if PEER in one["seconds"]
-    ]
-    yield Section("stages with nothing and with all skipped, ms", stages, ("Medians.",), stacked=True)
-    images = [row for one in scenes for row in _image_rows(one)]
-    yield Section("images, dB PSNR", images, ("Means over the drives' steps; inf: the same.",))
-    left_out = [
-        Measurement(what, one["name"], counted(count)) for one in scenes for what, count in one["splatter"].items()
-    ]
-    note = "Of the drives' last steps, with all skipped. It can't be switched off."
-    yield Section("what the splatter leaves out", left_out, (note,))
-    targets = [target for one in scenes for target in verdicts(one)]
-    cells = [
-        Measurement(str(target["what"]), column, str(text))
-        for target in targets
-        for column, text in (("wanted", target["wanted"]), ("got", target["got"]), ("verdict", word(target)))
-    ]
-    yield Section("targets" if cells else "", cells, details={"targets": targets})
-
-
-def _image_rows(scene: Record) -> Iterator[Measurement]:
-    name, images, loss = scene["name"], scene["pictures"], _loss(scene)
-    yield Measurement(name, f"{ALL} against {NONE}", images["against_nothing"], "dB", ".2f")
-    if loss is not None:
-        yield Measurement(name, f"{NONE} against truth", images["truth_nothing"], "dB", ".2f")
-        truth = images["truth_all"]
-        yield Measurement(name, f"{ALL} against truth", truth, "dB", ".2f", f"{name}: {ALL} against truth", "higher")
-        yield Measurement(name, "lost", loss, "dB", ".2f", f"{name}: lost")
+        found["target drop"] = f"<= {MOST_LOSS:g} {verdict(loss <= MOST_LOSS, timed=False)}"
+    return found
 
 
 def counted(count: Count) -> str:

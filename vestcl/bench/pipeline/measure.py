@@ -6,14 +6,14 @@ import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.timing import Spread, Task
-from vestcl.bench.pipeline.splatter import counting
 from vestcl.bench.pipeline.traffic import Drive, Window
 from vestcl.evaluation import metrics
 from vestcl.models.forecaster import Forecaster
@@ -24,54 +24,29 @@ from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.opencl import trace
 from vestcl.scene.layers import build_layers
 
-Record = dict[str, Any]
-
 #: Also timed, in turns with the variants: the peer, a copy of the frames' layers, and what a new frame needs before.
 PEER, COPY, INPAINT = "DMVFN", "copy", "inpaint"
 
 NONE, ALL = "nothing skipped", "all skipped"
 
-#: Nothing skipped, where a camera is asked for twice: what "views" is compared with.
-TWICE: Final = "nothing skipped, the view twice"
-
 #: Of `InferenceOptions`, in the order of a forecast.
-SWITCHES: Final = ("seen", "background", "objects", "covered", "views")
+SWITCHES: Final = ("seen", "background", "objects", "covered")
 
 
-@dataclass(frozen=True)
-class Variant:
-    """A way to make the same forecast."""
-
-    name: str
-    options: InferenceOptions
-    base: str | None = None
-    """The variant that it is compared with."""
-    switch: str | None = None
-    """The one that is on, where it is only one."""
-
-    @property
-    def twice(self) -> bool:
-        """Whether the view is asked for twice."""
-        return TWICE in (self.name, self.base)
-
-
-def variants(options: InferenceOptions) -> list[Variant]:
-    """Nothing skipped, each switch by itself, and all that ``options`` has on."""
+def variants(options: InferenceOptions) -> dict[str, InferenceOptions]:
+    """By name: nothing skipped, each of SWITCHES by itself, and all that ``options`` have on."""
     nothing = options.without_skips()
-    found = [Variant(NONE, nothing), Variant(TWICE, nothing)]
-    for switch in SWITCHES:
-        one = dataclasses.replace(nothing, **{switch: True})  # type: ignore[arg-type]
-        found.append(Variant(f"{switch} alone", one, TWICE if switch == "views" else NONE, switch))
-    return [*found, Variant(ALL, options, NONE)]
+    alone = {f"{name} alone": dataclasses.replace(nothing, **{name: True}) for name in SWITCHES}  # type: ignore[arg-type]
+    return {NONE: nothing, **alone, ALL: options}
 
 
 class Stepper:
     """One variant's forecast steps, window after window, round and round."""
 
-    def __init__(self, model: Forecaster, variant: Variant, drive: Drive) -> None:
-        self.variant, self._drive = variant, drive
+    def __init__(self, model: Forecaster, name: str, options: InferenceOptions, drive: Drive) -> None:
+        self._name, self._drive = name, drive
         self._model = copy.deepcopy(model)  # each variant remembers its own frames
-        self._model.options = variant.options
+        self._model.options = options
         self._windows = itertools.cycle(enumerate(drive.windows))
         self.stages: list[dict[str, float]] = []
         self.places: list[int] = []
@@ -85,9 +60,9 @@ class Stepper:
     def _forecast(self, window: Window) -> torch.Tensor:
         given = window.given
         prior = given.prior if self._model.config.start == "prior" else None
-        views = [(window.tgt_from_next, given.K)] * (2 if self.variant.twice else 1)
+        views = [(window.tgt_from_next, given.K)]
         start = time.perf_counter()
-        with trace.stage(self.variant.name), watching() as watch:
+        with trace.stage(self._name), watching() as watch:
             done = self._model.forecast(*window.frames, given.K, 1, views, prior=prior, own=given.own)
         self.stages.append(with_rest(watch.seconds, time.perf_counter() - start))
         return done[0].views[0].image
@@ -101,19 +76,27 @@ class Stepper:
             images = [self._forecast(window) for window in windows[warm:]]
         return images, tally.counts
 
-    def splatter(self) -> dict[str, Count]:
-        """What the splatter left out of the drive's last step."""
-        with counting(self._model.options.min_transmittance) as found:
-            self._forecast(self._drive.windows[-1])
-        points, tiles, pixels = (sum(getattr(one, name) for one in found) for name in ("points", "tiles", "pixels"))
-        return {
-            "points without fragments": Count(sum(one.culled for one in found), points, "points"),
-            "empty tiles": Count(sum(one.empty_tiles for one in found), tiles, "tiles"),
-            "saturated pixels": Count(sum(one.saturated_pixels for one in found), pixels, "px"),
-        }
+
+@dataclass(frozen=True)
+class Measured:
+    """A scene; times are of the same rounds, an element each, in seconds."""
+
+    name: str
+    foreground: float
+    """Share of the pixels."""
+    times: dict[str, NDArray[np.float64]]
+    """By variant, COPY, INPAINT and, if it ran, PEER."""
+    stages: dict[str, dict[str, Spread]]
+    """By variant and stage."""
+    counts: dict[str, Count]
+    """By variant with one switch on: what was skipped."""
+    against_nothing: float
+    """Mean PSNR over the drive of all skipped against nothing skipped, dB."""
+    truth: tuple[float, float] | None
+    """The same of nothing skipped and of all skipped against the truth, if that is known."""
 
 
-def measure_scene(model: Forecaster, drive: Drive, seconds: float, threads: int, peer: bool) -> Record:
+def measure_scene(model: Forecaster, drive: Drive, seconds: float, threads: int, peer: bool) -> Measured:
     """Time a scene. Steps that begin a drive, with no frame known, don't count.
 
     Args:
@@ -122,49 +105,34 @@ def measure_scene(model: Forecaster, drive: Drive, seconds: float, threads: int,
         seconds: about how long it takes.
         threads: of the copy; torch's are as they are.
         peer: whether DMVFN runs, too.
-
-    Returns:
-        "name", "foreground" (share of the pixels), "others_cores"; by variant, PEER, COPY and INPAINT "seconds"; by
-        variant that has a base "saved", s of the base's step in the same round, and "saved_share" of it; by variant
-        and stage "stages", s; "counts", what each switch skipped; "splatter", what the splatter left out with all
-        skipped, which has no switch; "of_peer" and "of_copy", the step with all skipped as multiples of theirs;
-        "pictures", what skipping changes.
     """
-    steppers = {variant.name: Stepper(model, variant, drive) for variant in variants(model.options)}
+    every = variants(model.options)
+    steppers = {name: Stepper(model, name, options, drive) for name, options in every.items()}
     tasks: dict[str, Task] = {name: stepper.step for name, stepper in steppers.items()}
     planes = torch.cat([plane for frame in drive.windows[0].frames for plane in frame], dim=1)
-    tasks |= {COPY: _timing.copies_of_forward(planes, threads)["torch copy_"], INPAINT: _inpaint(drive)}
+    tasks |= {COPY: _timing.memcpy(threads, planes), INPAINT: _inpaint(drive)}
     tasks |= {PEER: _peer(drive)} if peer else {}
-    with torch.inference_mode(), _timing.recycling_allocator(), _timing.watching_others() as others:
+    with torch.inference_mode(), _timing.recycling_allocator():
         times = _timing.interleave(tasks, seconds, least=drive.warm + _timing.LEAST_ROUNDS)
     count = len(times[NONE])  # before those, tasks ran to get warm
     counted = np.array(steppers[NONE].places[-count:]) >= drive.warm
-    times = {name: found[counted] for name, found in times.items()}
     stages = {
         name: Spread.of_each([run for run, counts in zip(one.stages[-count:], counted, strict=True) if counts])
         for name, one in steppers.items()
     }
     with torch.inference_mode():
         looks = {name: stepper.look() for name, stepper in steppers.items()}
-        splatter = steppers[ALL].splatter()
-    switches = {one.variant.switch: looks[name][1] for name, one in steppers.items() if one.variant.switch}
-    saved = {
-        one.variant.name: (times[name], times[one.variant.base]) for name, one in steppers.items() if one.variant.base
-    }
-    return {
-        "name": drive.name,
-        "foreground": drive.foreground,
-        "seconds": {name: Spread.of(found) for name, found in times.items()},
-        "saved": {name: Spread.of(base - own) for name, (own, base) in saved.items()},
-        "saved_share": {name: Spread.of(1 - own / base) for name, (own, base) in saved.items()},
-        "stages": stages,
-        "counts": {switch: counts[switch] for switch, counts in switches.items() if switch in counts},
-        "splatter": splatter,
-        "of_peer": Spread.of(times[ALL] / times[PEER]) if peer else None,
-        "of_copy": Spread.of(times[ALL] / times[COPY]),
-        "pictures": _pictures(drive, looks[NONE][0], looks[ALL][0]),
-        "others_cores": others.cores,
-    }
+    truths = [window.truth for window in drive.windows[drive.warm :]]
+    nothing, skipped = looks[NONE][0], looks[ALL][0]
+    return Measured(
+        drive.name,
+        drive.foreground,
+        {name: found[counted] for name, found in times.items()},
+        stages,
+        {f"{of} alone": looks[f"{of} alone"][1][of] for of in SWITCHES if of in looks[f"{of} alone"][1]},
+        _psnr(skipped, nothing),
+        None if None in truths else (_psnr(nothing, truths), _psnr(skipped, truths)),
+    )
 
 
 def _inpaint(drive: Drive) -> Task:
@@ -191,14 +159,9 @@ def _peer(drive: Drive) -> Task:
     return forecast
 
 
-def _pictures(drive: Drive, nothing: list[torch.Tensor], skipped: list[torch.Tensor]) -> dict[str, float | None]:
-    """Mean PSNR over a drive, dB: with all skipped against nothing skipped, and both against the truth, if known."""
-    truths = [window.truth for window in drive.windows[drive.warm :]]
-
-    def mean(found: Sequence[torch.Tensor], wanted: Sequence[torch.Tensor | None]) -> float | None:
-        pairs = [(one, other) for one, other in zip(found, wanted, strict=True) if other is not None]
-        known = [metrics.psnr(one.clamp(0, 1), other.clamp(0, 1)).item() for one, other in pairs]
-        return float(np.mean(known)) if known else None
-
-    known = {"truth_nothing": mean(nothing, truths), "truth_all": mean(skipped, truths)}
-    return {"against_nothing": mean(skipped, nothing), **known}
+def _psnr(found: Sequence[torch.Tensor], wanted: Sequence[torch.Tensor | None]) -> float:
+    """Mean over a drive, dB."""
+    pairs = [
+        (one.clamp(0, 1), other.clamp(0, 1)) for one, other in zip(found, wanted, strict=True) if other is not None
+    ]
+    return float(np.mean([metrics.psnr(one, other).item() for one, other in pairs]))

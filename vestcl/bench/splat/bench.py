@@ -1,20 +1,28 @@
-"""`vestcl bench splat`: splat in turns with a copy of its bytes and with torch, and kernel by kernel."""
+"""`vestcl bench splat`: splat in turns with a copy of its bytes and with torch.
 
-import contextlib
-from collections.abc import Iterator, Sequence
+All times are seconds; every ratio is of two runs in the same round.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
+import numpy as np
+import torch
 from rich.console import Console
 
-from vestcl import opencl
+from vestcl import opencl, reference
 from vestcl.bench.common import results
+from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.options import Options
-from vestcl.bench.common.table import Section, busy
-from vestcl.bench.splat import measure, pytorch3d, torch_peer
+from vestcl.bench.common.plots import bars
+from vestcl.bench.common.results import X_COPY
+from vestcl.bench.common.table import Measurement, Section, verdict
+from vestcl.bench.common.timing import Spread, Task
+from vestcl.bench.splat import pytorch3d, torch_peer
 from vestcl.bench.splat.kernels import facts_of
-from vestcl.bench.splat.scenes import CHANNELS, Scene, street
+from vestcl.bench.splat.scenes import CHANNELS, DIFFERENTIATED, Scene, both_passes, street
 from vestcl.opencl import trace
 
 #: What ``--channels`` times: colour, colour and coverage, half the features, all, all that a side renders, twice.
@@ -25,6 +33,16 @@ SIZES: Final = ((64, 208), (128, 416), (256, 832), (512, 1664), (1024, 3328), (2
 
 #: (height, width, radius) -> copies that forward, and forward + backward, may take.
 TARGETS: Final = {(256, 832, 1.0): (4.0, 6.0), (256, 832, 2.0): (10.0, 16.0)}
+
+#: How many times faster than torch, forward + backward; scratch memory of forward + backward, in features.
+PEER_TARGET: Final = 10.0
+MEMORY_TARGET: Final = 1.5
+
+#: Of tables, and of figures' names.
+PASSES: Final = {"forward": "forward", "both": "forward + backward"}
+
+Splatter = Callable[[Scene], torch.Tensor]
+"""Makes the image of a scene."""
 
 
 @dataclass(frozen=True)
@@ -64,28 +82,92 @@ def main(config: SplatBench) -> None:
     results.run("splat", config, partial(_sections, config))
 
 
-def _sections(config: SplatBench, session: opencl.Session, console: Console) -> Iterator[Section]:
+def _sections(config: SplatBench, _: opencl.Session, console: Console) -> Iterator[Section]:
     """Everything on one device."""
-    size, threads = (config.height, config.width), config.threads
-    scenes = [street(*size, CHANNELS, radius, config.seed) for radius in config.radii]
-    for scene, radius in zip(scenes, config.radii, strict=True):
-        with _stage(console, f"splat next to copies, radius {radius:g}"):
-            targets = TARGETS.get((*size, radius), (None, None))
-            found = measure.measure_speed(scene, config.seconds, threads, targets)
-        yield Section(
-            found["facts"].title, [*measure.speed_rows(found)], busy(found["others_cores"]), {"speed": [found]}
-        )
+    size, radii = (config.height, config.width), config.radii
+    yield _timed(config, console, "Splat", [(*size, CHANNELS, radius) for radius in radii])
     if config.peers:
-        yield from _peers(config, console, scenes)
-    yield from _inside(console, scenes)
-    sizes = [(*size, CHANNELS, radius) for radius in config.radii for size in SIZES] if config.scaling else []
-    yield from _series(config, console, "scaling", "Over size", sizes)
-    sizes = [(*size, count, radius) for radius in config.radii for count in CHANNEL_SWEEP] if config.channels else []
-    yield from _series(config, console, "channels", "Over channels", sizes)
+        yield from _peers(config, console)
+    if config.scaling:
+        sizes = [(*size, CHANNELS, radius) for radius in radii for size in SIZES]
+        yield _timed(config, console, "Over size", sizes, "over size: ")
+    if config.channels:
+        sizes = [(*size, count, radius) for radius in radii for count in CHANNEL_SWEEP]
+        yield _timed(config, console, "Over channels", sizes, "over channels: ")
 
 
-def _peers(config: SplatBench, console: Console, scenes: Sequence[Scene]) -> Iterator[Section]:
-    expanding, compiled = _expanding(config, console)
+# ---------------------------------------------------------------- in turns with copies
+
+
+def _timed(
+    config: SplatBench, console: Console, title: str, sizes: Sequence[tuple[int, int, int, float]], prefix: str = ""
+) -> Section:
+    """Scenes by (height, width, channels, radius), a row each; targets where figures have no ``prefix``."""
+    rows = list[Measurement]()
+    for height, width, channels, radius in sizes:
+        with console.status(f"{title} {height}x{width}"), trace.stage(f"{title}, radius {radius:g}"):
+            scene = street(height, width, channels, radius, config.seed)
+            targets = (None, None) if prefix else TARGETS.get((height, width, radius), (None, None))
+            rows += speed_rows(scene, config.seconds, config.threads, targets, prefix)
+            rows += [] if prefix else memory_rows(scene)
+    plot = partial(bars, columns=("forward ms", "both ms", "copy ms"))
+    return Section(title, rows, (), {f"splat {title}": plot})
+
+
+def speed_rows(
+    scene: Scene, seconds: float, threads: int, targets: tuple[float | None, float | None], prefix: str
+) -> list[Measurement]:
+    """Time `splat` in turns with copies of its bytes.
+
+    Args:
+        scene: what is splatted.
+        seconds: about how long to measure.
+        threads: of the copies.
+        targets: of the ratios to the copies, forward and both.
+        prefix: of the figures' names.
+    """
+    facts = facts_of(scene)
+    copies = {"copy": _timing.memcpy(threads, scene.features)}
+    copies |= {"add": _timing.memcpy(threads, scene.features, torch.ones_like(scene.features))}
+    tasks: dict[str, Task] = {"forward": scene.forward, "both": both_passes(scene), **copies}
+    times = _timing.interleave(tasks, seconds)
+    copy, back_copy = times["copy"], times["add"]
+    rows = [Measurement(facts.size, "fragments", f"{facts.fragments:,}")]
+    for key, moved, target in zip(PASSES, (copy, copy + back_copy), targets, strict=True):
+        ratio, name = Spread.of(times[key] / moved), f"{prefix}splat {PASSES[key]}, {facts.size}"
+        rows += [
+            Measurement(facts.size, f"{key} ms", Spread.of(times[key]), "s", name=name),
+            Measurement(facts.size, f"{key} x copy", ratio, digits=".1f", name=name + X_COPY),
+        ]
+        if target is not None:
+            word = verdict(ratio.median <= target)
+            rows.append(Measurement(facts.size, f"{key} target", f"<= {target:g} {word}"))
+        per_pixel = float(np.median(times[key])) * 1e9 / (facts.height * facts.width)
+        rows.append(Measurement(facts.size, f"{key} ns/pixel", per_pixel, digits=".1f"))
+    return [*rows, Measurement(facts.size, "copy ms", Spread.of(copy), "s", ".2f")]
+
+
+def memory_rows(scene: Scene) -> list[Measurement]:
+    """The pool that one forward + backward leaves behind: it never shrinks by itself, so that is its peak."""
+    session, facts = opencl.current(), facts_of(scene)
+    session.free_scratch()
+    before = session.scratch_bytes
+    both_passes(scene)()
+    scratch, features = session.scratch_bytes - before, scene.features.nbytes
+    word = verdict(scratch <= MEMORY_TARGET * features, timed=False)
+    return [
+        Measurement(facts.size, "scratch MB", scratch, "B", ".1f", f"scratch memory, radius {facts.radius:g}"),
+        Measurement(facts.size, "x features", scratch / features, digits=".2f"),
+        Measurement(facts.size, "target", f"<= {MEMORY_TARGET:g} {word}"),
+    ]
+
+
+# ---------------------------------------------------------------- in turns with peers
+
+
+def _peers(config: SplatBench, console: Console) -> Iterator[Section]:
+    expanding, size = _expanding(config, console), (config.height, config.width)
+    scenes = [street(*size, CHANNELS, radius, config.seed) for radius in config.radii]
     pairs = [(scene, {"sparse": partial(torch_peer.splat, expanding=expanding)}) for scene in scenes]
     if pytorch3d.is_installed():
         scene = street(*pytorch3d.SIZE, CHANNELS, config.radii[0], config.seed)
@@ -93,55 +175,56 @@ def _peers(config: SplatBench, console: Console, scenes: Sequence[Scene]) -> Ite
     else:
         console.print("PyTorch3D is not installed: skipped")
     for scene, peers in pairs:
-        with _stage(console, f"splat next to {', '.join(peers)}"):
-            found = measure.measure_peers(scene, peers, config.seconds)
-        title = f"{found['facts'].title}; errors relative to the reference in float64"
-        yield Section(title, [*measure.peer_rows(found)], busy(found["others_cores"]), {"peers": [found]})
-    yield Section("", [], details={"peers_compiled": compiled})
+        with console.status(f"splat next to {', '.join(peers)}"), trace.stage(f"splat next to {', '.join(peers)}"):
+            yield peer_section(scene, peers, config.seconds)
 
 
-def _expanding(config: SplatBench, console: Console) -> tuple[torch_peer.Expand, bool]:
-    """How the peer finds its fragments, and whether torch.compile could help."""
-    if not config.compile:
-        return torch_peer.expand, False
-    try:
-        with console.status("torch.compile for the peers"):
-            return torch_peer.compiled_expand(), True
-    except RuntimeError as error:
-        console.print(f"peers without torch.compile: {str(error).splitlines()[0]}", markup=False, soft_wrap=True)
-        return torch_peer.expand, False
+def _expanding(config: SplatBench, console: Console) -> torch_peer.Expand:
+    """How the peer finds its fragments: by torch.compile where it can help."""
+    if config.compile:
+        try:
+            with console.status("torch.compile for the peers"):
+                return torch_peer.compiled_expand()
+        except RuntimeError as error:
+            console.print(f"peers without torch.compile: {str(error).splitlines()[0]}", markup=False, soft_wrap=True)
+    return torch_peer.expand
 
 
-def _inside(console: Console, scenes: Sequence[Scene]) -> Iterator[Section]:
-    """Kernels and memory."""
-    for scene in scenes:
-        with _stage(console, "kernels"):
-            found = measure.measure_kernels(scene)
-        title = f"Kernels of one forward + backward, radius {found['radius']:g} px"
-        notes = busy(found["others_cores"])
-        yield Section(title, [*measure.kernel_rows(found)], notes, {"kernels": [found]}, plots=(("ms",),))
-    memories = [measure.measure_memory(scene) for scene in scenes]
-    yield Section(
-        "Scratch memory of forward + backward", [*measure.memory_rows(memories)], details={"memory": memories}
-    )
+def peer_section(scene: Scene, peers: Mapping[str, Splatter], seconds: float) -> Section:
+    """vestcl and all ``peers`` in turns, in the same process, with memory recycled for all.
+
+    Errors are relative, in the Euclidean norm, against the reference in float64: of the image and of each gradient.
+    """
+    images, size = {"vestcl": Scene.forward, **peers}, facts_of(scene).size
+    tasks: dict[str, Task] = {}
+    for name, image_of in images.items():
+        tasks |= {f"{name} forward": partial(image_of, scene), f"{name} both": both_passes(scene, image_of)}
+    with _timing.recycling_allocator():
+        times = _timing.interleave(tasks, seconds)
+    truth, rows = _image_and_grads(scene.double(), _reference), list[Measurement]()
+    for name, image_of in images.items():
+        for key, way in PASSES.items():
+            own, figure = times[f"{name} {key}"], f"{name} / splat {way}, {size}" if name in peers else ""
+            ratio = Spread.of(own / times[f"vestcl {key}"])
+            rows.append(Measurement(name, f"{key} ms", Spread.of(own), "s", ".1f"))
+            rows.append(Measurement(name, f"{key} x vestcl", ratio, "1", ".1f", figure, "higher"))
+        if name in peers:
+            word = verdict(ratio.median >= PEER_TARGET)
+            rows.append(Measurement(name, "target", f">= {PEER_TARGET:g} {word}"))
+        got = _image_and_grads(scene, image_of)
+        for key, true in truth.items():
+            error = float((got[key].double() - true).norm() / true.norm())
+            rows.append(Measurement(name, f"error of {key}", error, digits=".0e"))
+    return Section(f"{size} px; errors relative to the reference in float64", rows)
 
 
-def _series(
-    config: SplatBench, console: Console, name: str, title: str, sizes: Sequence[tuple[int, int, int, float]]
-) -> Iterator[Section]:
-    """Time scenes by (height, width, channels, radius), one by one; no section without any."""
-    speeds = []
-    for size in sizes:
-        with _stage(console, f"{title} {size}"):
-            speeds.append(measure.measure_speed(street(*size, config.seed), config.seconds, config.threads))
-    if speeds:
-        notes, columns = busy(*(speed["others_cores"] for speed in speeds)), (("forward ms", "both ms", "copy ms"),)
-        rows = [*measure.series_rows(title, speeds)]
-        yield Section(title, rows, (*measure.growth_notes(speeds), *notes), {name: speeds}, columns)
+def _reference(scene: Scene) -> torch.Tensor:
+    arrays = (scene.points_uv, scene.z, scene.radii, scene.opacities, scene.features)
+    return reference.splat(*arrays, scene.height, scene.width)[0]
 
 
-@contextlib.contextmanager
-def _stage(console: Console, name: str) -> Iterator[None]:
-    """Name what is measured, on the screen and in the trace."""
-    with console.status(name), trace.stage(name):
-        yield
+def _image_and_grads(scene: Scene, image_of: Splatter) -> dict[str, torch.Tensor]:
+    recording = scene.requiring_grad()
+    image = image_of(recording)
+    grads = torch.autograd.grad(image, recording.leaves, recording.grad_image)
+    return {"image": image.detach(), **dict(zip(DIFFERENTIATED, grads, strict=True))}

@@ -1,4 +1,4 @@
-"""The kernels of a call: their time, from OpenCL events, and the bytes and flops that splat's must move and compute."""
+"""What a scene is made of, and the kernels of a call with their time, from OpenCL events."""
 
 import time
 from collections import Counter
@@ -13,7 +13,6 @@ from vestcl import opencl
 from vestcl.bench.common.timing import Task, watching_others
 from vestcl.bench.splat.scenes import Scene
 from vestcl.bench.splat.torch_peer import list_fragments
-from vestcl.ops.splat import rasterize
 
 #: Profiled calls: medians of that many have settled.
 CALLS: Final = 15
@@ -39,54 +38,6 @@ class Facts:
         """ "256x832, C = 32, radius 1"."""
         return f"{self.height}x{self.width}, C = {self.channels}, radius {self.radius:g}"
 
-    @property
-    def title(self) -> str:
-        """The same, and how much there is to do."""
-        return f"{self.size} px: {self.fragments:,} fragments, at most {self.most_layers} on a pixel"
-
-
-@dataclass(frozen=True)
-class Profile:
-    """Some calls; all arrays have an element per call, in seconds."""
-
-    launches: Counter[str]
-    """Of one call, by kernel, in the order of their first launch."""
-    seconds: dict[str, NDArray[np.float64]]
-    """By kernel, all launches of a call together."""
-    calls: NDArray[np.float64]
-    """From begin to end."""
-    others_cores: float | None
-    """That other processes kept busy meanwhile."""
-
-    @property
-    def kernels(self) -> NDArray[np.float64]:
-        """While a kernel ran."""
-        return np.sum(list(self.seconds.values()), axis=0)
-
-    @property
-    def around(self) -> NDArray[np.float64]:
-        """While no kernel ran: Python, autograd, launches."""
-        return self.calls - self.kernels
-
-
-def profile(task: Task, calls: int = CALLS, before: Callable[[], object] = lambda: None) -> Profile:
-    """Call ``task`` on the current device with profiling; kernels of what runs ``before`` each call are listed, too."""
-    session, runs, walls = opencl.current(), [], []
-    with watching_others() as others:
-        for _ in range(calls):
-            with session.profile() as times:
-                before()
-                start = time.perf_counter()
-                task()
-                walls.append(time.perf_counter() - start)
-            runs.append(times)
-    launches = Counter(kernel.name for kernel in runs[0])
-    seconds = {
-        name: np.array([sum(one.end_ns - one.start_ns for one in times if one.name == name) / 1e9 for times in runs])
-        for name in launches
-    }
-    return Profile(launches, seconds, np.array(walls), others.cores)
-
 
 def facts_of(scene: Scene) -> Facts:
     """Count what there is in ``scene``."""
@@ -104,39 +55,42 @@ def facts_of(scene: Scene) -> Facts:
     )
 
 
-def bytes_of(scene: Scene, facts: Facts) -> dict[str, int]:
-    """What each kernel must move, bytes, by name; not for those that take next to no time."""
-    raster = rasterize(scene.points_uv, scene.z, scene.radii, scene.opacities, scene.height, scene.width)
-    real, index = scene.z.element_size(), 4
-    row, number = real * facts.channels, real + index
-    entries = int(raster.lists.tile_starts[-1])
-    lists, records = 2 * real * entries, (4 * real + 2 * index) * entries
-    pixels, shown = facts.height * facts.width, facts.shown_points
-    forward = records + row * shown + (row + real) * pixels
-    sort = lists + records + 4 * real * shown
-    return {
-        "count_tiles": (5 * real + index) * facts.points,
-        "fill_tiles": number * facts.points + lists,
-        "sort_tiles": sort,
-        "sort_tiles_together": sort,
-        "composite_tiles": forward,
-        "composite_pixels": forward,
-        "clear_gradients": index * facts.points + (row + 4 * real) * (facts.points - shown),
-        "composite_tiles_backward": records + (2 * row + 4 * real) * shown + row * pixels,
+@dataclass(frozen=True)
+class Profile:
+    """Some calls; all arrays have an element per call, in seconds."""
+
+    launches: Counter[str]
+    """Of one call, by kernel, in the order of their first launch."""
+    seconds: dict[str, NDArray[np.float64]]
+    """By kernel, all launches of a call together."""
+    calls: NDArray[np.float64]
+    """From begin to end."""
+
+    @property
+    def kernels(self) -> NDArray[np.float64]:
+        """While a kernel ran."""
+        return np.sum(list(self.seconds.values()), axis=0)
+
+    @property
+    def around(self) -> NDArray[np.float64]:
+        """While no kernel ran: Python, autograd, launches."""
+        return self.calls - self.kernels
+
+
+def profile(task: Task, calls: int = CALLS, before: Callable[[], object] = lambda: None) -> Profile:
+    """Call ``task`` on the current device with profiling; kernels of what runs ``before`` each call are listed, too."""
+    session, runs, walls = opencl.current(), [], []
+    with watching_others():
+        for _ in range(calls):
+            with session.profile() as times:
+                before()
+                start = time.perf_counter()
+                task()
+                walls.append(time.perf_counter() - start)
+            runs.append(times)
+    launches = Counter(kernel.name for kernel in runs[0])
+    seconds = {
+        name: np.array([sum(one.end_ns - one.start_ns for one in times if one.name == name) / 1e9 for times in runs])
+        for name in launches
     }
-
-
-def flops_of(facts: Facts) -> dict[str, int]:
-    """Additions and multiplications that the formulas of `splat` ask of each kernel, by name; sorting has none.
-
-    A fragment's alpha takes 7 (two differences, d2, the slope), its weight and what it lets through 3, its features two
-    a channel. Backward: alpha and what it lets through 9, the weight 1, two dot products a channel, 18 for the rest.
-    """
-    pixels, fragments, channels = facts.height * facts.width, facts.fragments, facts.channels
-    forward = (10 + 2 * channels) * fragments + (1 + 2 * channels) * pixels
-    return {
-        "count_tiles": 18 * facts.points,  # the corners of the footprint 8, whether all numbers are finite 10
-        "composite_tiles": forward,
-        "composite_pixels": forward,
-        "composite_tiles_backward": (28 + 4 * channels) * fragments,
-    }
+    return Profile(launches, seconds, np.array(walls))

@@ -13,12 +13,12 @@ from vestcl import opencl, reference
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
 from vestcl.bench.common.options import Options
+from vestcl.bench.common.plots import bars
 from vestcl.bench.common.results import X_COPY
-from vestcl.bench.common.table import Measurement, Section, busy
+from vestcl.bench.common.table import Measurement, Section
 from vestcl.bench.common.timing import Spread, Task
 from vestcl.bench.splat import roofline
 from vestcl.bench.splat.kernels import profile
-from vestcl.bench.splat.measure import Record
 from vestcl.bench.splat.scenes import AHEAD, CHANNELS, street
 from vestcl.data import Street, intrinsics
 from vestcl.opencl import trace
@@ -114,8 +114,11 @@ def operators(config: OperatorsBench) -> Iterator[Operator]:
     yield Operator("splat", splat, reference.splat, cloud, (0, 2, 3, 4))
 
 
-def measure(operator: Operator, seconds: float, threads: int) -> list[Record]:
+def measure(operator: Operator, seconds: float, threads: int) -> list[Measurement]:
     """Time an operator, its reference and copies in turns, then profile its kernels.
+
+    Bytes are read and written, every array once. The error is the largest of the results' distances to the reference's,
+    relative, in the Euclidean norm.
 
     Args:
         operator: with its arguments.
@@ -123,33 +126,39 @@ def measure(operator: Operator, seconds: float, threads: int) -> list[Record]:
         threads: of the copies.
 
     Returns:
-        One of each of `PASSES`. "moved_bytes" are read and written, every array once; "kernels" are seconds that
-        kernels ran, of profiled calls, and "around" those in which none did; "error" is the largest of the results'
-        distances to the reference's, relative, in the Euclidean norm.
+        A row for each of `PASSES`.
     """
     outputs = operator.run(operator.ours)
     grads = tuple(torch.randn_like(output) for output in outputs)
-    runs = {"vestcl": _passes(operator, operator.ours, grads), "twin": _passes(operator, operator.reference, grads)}
+    ours, others = (_passes(operator, function, grads) for function in (operator.ours, operator.reference))
     moved = _moved_bytes(operator, outputs)
     # Ones, not zeros: memory that was never written is one page of zeros, and reading it costs nothing.
-    copies = {what: _timing.copies_of_forward(torch.ones(size // 8), threads) for what, size in moved.items()}
-    tasks: dict[str, Task] = {f"{what}, {who}": task for who, own in runs.items() for what, task in own.items()}
-    tasks |= {f"{what}, {by}": task for what, ways in copies.items() for by, task in ways.items()}
-    with _timing.watching_others() as others:
-        staged = {name: partial(_staged, f"{operator.name} {name}", task) for name, task in tasks.items()}
-        times = _timing.interleave(staged, seconds)
-    found = []
+    copies = {what: _timing.memcpy(threads, torch.ones(size // 8)) for what, size in moved.items()}
+    tasks = {
+        f"{what}, {who}": task
+        for who, own in (("vestcl", ours), ("reference", others), ("copy", copies))
+        for what, task in own.items()
+    }
+    staged = {name: partial(_staged, f"{operator.name} {name}", task) for name, task in tasks.items()}
+    times = _timing.interleave(staged, seconds)
+    rows = list[Measurement]()
     for what in PASSES:
-        by = min(copies[what], key=lambda way: float(np.median(times[f"{what}, {way}"])))
-        ours, twin, copy = (times[f"{what}, {who}"] for who in ("vestcl", "twin", by))
-        inside = profile(runs["vestcl"][what])
-        seconds_of = {"time": ours, "x_copy": ours / copy, "twin": twin, "x_twin": twin / ours, "copy": copy}
-        seconds_of |= {"kernels": inside.kernels, "around": inside.around}
-        about = {"copied_by": by, "moved_bytes": moved[what], "others_cores": others.cores}
-        error = max(map(_distance, runs["vestcl"][what](), runs["twin"][what]()))
-        spreads = {name: Spread.of(values) for name, values in seconds_of.items()}
-        found.append({"operator": operator.name, "what": what, **spreads, **about, "error": error})
-    return found
+        own, theirs, copy = (times[f"{what}, {who}"] for who in ("vestcl", "reference", "copy"))
+        name, inside, size = f"{operator.name} {what}", profile(ours[what]), moved[what]
+        error = max(map(_distance, ours[what](), others[what]()))
+        rows += [
+            Measurement(name, "ms (quartiles)", Spread.of(own), "s", name=name),
+            Measurement(name, "MB", size, "B", ".1f"),
+            Measurement(name, "GB/s", size / 1e9 / float(np.median(own)), digits=".1f"),
+            Measurement(name, "copy ms", Spread.of(copy), "s", ".2f"),
+            Measurement(name, "x copy", Spread.of(own / copy), digits=".1f", name=name + X_COPY),
+            Measurement(name, "kernels ms", Spread.of(inside.kernels), "s", ".2f", f"{name}, kernels"),
+            Measurement(name, "around ms", Spread.of(inside.around), "s", ".2f", f"{name}, around kernels"),
+            Measurement(name, "reference ms", Spread.of(theirs), "s", ".2f"),
+            Measurement(name, "x reference", Spread.of(theirs / own), "1", ".1f", f"{name}, twin / vestcl", "higher"),
+            Measurement(name, "error", error, digits=".0e"),
+        ]
+    return rows
 
 
 def _passes(operator: Operator, function: Callable[..., Any], grads: Tensors) -> dict[str, Callable[[], Tensors]]:
@@ -178,38 +187,20 @@ def _distance(got: torch.Tensor, true: torch.Tensor) -> float:
     return float((got - true).norm() / true.norm())
 
 
-# ---------------------------------------------------------------- one device's results
-
-
 def _sections(config: OperatorsBench, _: opencl.Session, console: Console) -> Iterator[Section]:
+    """Everything on one device."""
     torch.manual_seed(config.seed)
-    timed: list[Record] = []
+    rows = list[Measurement]()
     for operator in operators(config):
         with console.status(operator.name), trace.stage(operator.name):
-            timed += measure(operator, config.seconds, config.threads)
+            rows += measure(operator, config.seconds, config.threads)
     size = f"{config.height}x{config.width}, C = {config.channels}, radius {config.radius:g} px, float32"
-    notes = (
-        "x copy: over a copy of the same bytes. kernels, around: of profiled calls.",
-        *busy(*(one["others_cores"] for one in timed)),
-    )
-    rows = [row for one in timed for row in _rows(one)]
-    columns = ("ms (quartiles)", "reference ms", "copy ms"), ("kernels ms", "around ms")
-    yield Section(f"Operators, {size}", rows, notes, {"operators": timed}, columns)
+    notes = ("x copy: over a copy of the same bytes. kernels, around: of profiled calls.",)
+    plots = {
+        "operators": partial(bars, columns=("ms (quartiles)", "reference ms", "copy ms")),
+        "operators, kernels": partial(bars, columns=("kernels ms", "around ms")),
+    }
+    yield Section(f"Operators, {size}", rows, notes, plots)
     if config.roofline:
         scene = street(config.height, config.width, config.channels, config.radius, config.seed)
-        yield roofline.section(roofline.roofline(scene))
-
-
-def _rows(one: Record) -> Iterator[Measurement]:
-    name = f"{one['operator']} {one['what']}"
-    yield Measurement(name, "ms (quartiles)", one["time"], "s", name=name)
-    yield Measurement(name, "runs", str(one["time"].runs))
-    yield Measurement(name, "MB", one["moved_bytes"], "B", ".1f")
-    yield Measurement(name, "GB/s", f"{one['moved_bytes'] / 1e9 / one['time'].median:.1f}")
-    yield Measurement(name, "copy ms", one["copy"], "s", ".2f")
-    yield Measurement(name, "x copy", one["x_copy"], digits=".1f", name=name + X_COPY)
-    yield Measurement(name, "kernels ms", one["kernels"], "s", ".2f", f"{name}, kernels")
-    yield Measurement(name, "around ms", one["around"], "s", ".2f", f"{name}, around kernels")
-    yield Measurement(name, "reference ms", one["twin"], "s", ".2f")
-    yield Measurement(name, "x reference", one["x_twin"], "1", ".1f", f"{name}, twin / vestcl", "higher")
-    yield Measurement(name, "error", one["error"], digits=".0e")
+        yield roofline.roofline(scene)

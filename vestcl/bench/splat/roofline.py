@@ -2,26 +2,23 @@
 
 A kernel that moves b bytes and computes f flops takes at least max(b / bandwidth, f / peak). Both roofs are measured in
 turns with the kernels: a copy past the cache, and chains of multiply-adds, both in OpenCL
-(kernels/splat/splat_roofline.cl). `python -m vestcl.bench.splat.roofline` measures several radii.
+(kernels/splat/splat_roofline.cl). `python -m vestcl.bench.splat.roofline` is the same command.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import sys
 from functools import partial
 from typing import Final
 
 import numpy as np
-import tyro
-from rich.console import Console
 
 from vestcl import opencl
-from vestcl.bench.common import results as _results
-from vestcl.bench.common.options import Options
-from vestcl.bench.common.table import Measurement, Section, busy
+from vestcl.bench.common.plots import bars
+from vestcl.bench.common.table import Measurement, Section
 from vestcl.bench.common.timing import Spread
-from vestcl.bench.splat.kernels import bytes_of, facts_of, flops_of, profile
-from vestcl.bench.splat.measure import Record, both_passes
-from vestcl.bench.splat.scenes import CHANNELS, Scene, street
+from vestcl.bench.splat.kernels import Facts, facts_of, profile
+from vestcl.bench.splat.scenes import Scene, both_passes
+from vestcl.cli.main import main
+from vestcl.ops.splat import rasterize
 
 _FILE: Final = "splat/splat_roofline.cl"
 
@@ -43,45 +40,8 @@ _GROUPS: Final = {"tile": 4, "pixel": 8}
 CALLS: Final = 30
 
 
-@dataclass(frozen=True)
-class RooflineBench(Options):
-    """How near each splat kernel comes to what its device can do."""
-
-    height: int = 256
-    """Pixels."""
-    width: int = 832
-    """Pixels."""
-    channels: int = CHANNELS
-    """Of the features."""
-    radii: tuple[float, ...] = (1.0, 2.0)
-    """Pixels; each is a scene of its own."""
-    calls: int = CALLS
-    """Profiled calls of forward + backward."""
-    seed: int = 0
-    """Of the street, opacities and features."""
-
-
-def main(config: RooflineBench) -> None:
-    """Measure, print and write.
-
-    Raises:
-        ValueError: a size, radius or number of calls that is not positive.
-        DeviceError: no such device.
-    """
-    _results.check_positive(config, "height", "width", "channels", "calls")
-    if not config.radii or min(config.radii) <= 0:
-        raise ValueError(f"`radii` must be one or more positive numbers, got {config.radii}")
-    _results.run("roofline", config, partial(_sections, config))
-
-
-def _sections(config: RooflineBench, session: opencl.Session, _: Console) -> Iterator[Section]:
-    for radius in config.radii:
-        scene = street(config.height, config.width, config.channels, radius, config.seed)
-        yield section(roofline(scene, config.calls))
-
-
-def roofline(scene: Scene, calls: int = CALLS, copy_bytes: int = COPY_BYTES) -> Record:
-    """Profile forward + backward in turns with the roofs, on the current device.
+def roofline(scene: Scene, calls: int = CALLS, copy_bytes: int = COPY_BYTES) -> Section:
+    """Profile forward + backward in turns with the roofs, on the current device; a row a kernel.
 
         share = max(bytes / bandwidth, flops / peak) / time
 
@@ -90,11 +50,6 @@ def roofline(scene: Scene, calls: int = CALLS, copy_bytes: int = COPY_BYTES) -> 
         calls: rounds of copy, multiply-adds and forward + backward.
         copy_bytes: that the copy reads, and as many that it writes.
 
-    Returns:
-        "facts"; the roofs "bandwidth" (bytes a second, read and written) and "peak" (flops a second); "points", those
-        kernels whose work is counted, with their share of the lower roof's median; seconds of a call ("call"), and
-        their medians while kernels ran ("kernels") and none did ("between").
-
     Raises:
         ValueError: ``calls`` or ``copy_bytes`` not positive.
 
@@ -102,27 +57,71 @@ def roofline(scene: Scene, calls: int = CALLS, copy_bytes: int = COPY_BYTES) -> 
     """
     if calls < 1 or copy_bytes < 1:
         raise ValueError(f"`calls` and `copy_bytes` must be positive, got {calls} and {copy_bytes}")
-    task, roofs = both_passes(scene), _Roofs(copy_bytes)
+    task, roofs, facts = both_passes(scene), _Roofs(copy_bytes), facts_of(scene)
     task()
     found = profile(task, calls, roofs.run)
     bandwidth = Spread.of(roofs.moved_bytes / found.seconds.pop("copy_numbers"))
     peak = Spread.of(roofs.flops / found.seconds.pop("multiply_add"))
-    facts = facts_of(scene)
-    moved, flops, points = bytes_of(scene, facts), flops_of(facts), list[Record]()
+    moved, flops, all_least = bytes_of(scene, facts), flops_of(facts), 0.0
+    radius, rows = f", radius {facts.radius:g}", list[Measurement]()
+    for name, unit, roof in (("bandwidth", "B/s", bandwidth), ("peak", "flop/s", peak)):
+        rows.append(Measurement(name, "", roof, unit, name=f"roofline {name}{radius}", better="higher"))
     for name in (name for name in found.seconds if name in moved):
         by_memory, by_compute = moved[name] / bandwidth.median, flops.get(name, 0) / peak.median
-        points.append({
-            "name": name,
-            "launches": found.launches[name],
-            "time": Spread.of(found.seconds[name]),
-            "moved_bytes": moved[name],
-            "flops": flops.get(name, 0),
-            "share": Spread.of(max(by_memory, by_compute) / found.seconds[name]),
-            "bound": "memory" if by_memory >= by_compute else "compute",
-        })  # fmt: skip
-    seconds = {"kernels": float(np.median(found.kernels)), "between": float(np.median(found.around))}
-    result = {"facts": facts, "bandwidth": bandwidth, "peak": peak, "points": points, "call": Spread.of(found.calls)}
-    return result | seconds | {"others_cores": found.others_cores}
+        least, share = max(by_memory, by_compute), Spread.of(max(by_memory, by_compute) / found.seconds[name])
+        rows += [
+            Measurement(name, "launches", str(found.launches[name])),
+            Measurement(name, "ms", Spread.of(found.seconds[name]), "s", ".3f"),
+            Measurement(name, "least ms", least, "s", ".3f"),
+            Measurement(name, "bound by", "memory" if by_memory >= by_compute else "compute"),
+            Measurement(name, "of the roof", share, "1", ".0%", f"roofline {name}{radius}", "higher"),
+        ]
+        all_least += least
+    kernels = float(np.median(found.kernels))
+    rows.append(Measurement("all kernels", "ms", kernels, "s", ".3f"))
+    rows.append(Measurement("all kernels", "of the roof", all_least / kernels, digits=".0%"))
+    rows.append(Measurement("no kernel running", "ms", float(np.median(found.around)), "s", ".3f"))
+    roofs_note = f"roofs: {bandwidth.median / 1e9:.1f} GB/s copied, {peak.median / 1e9:.0f} Gflop/s"
+    title, plot = f"Roofline, {facts.size} px", partial(bars, columns=("ms", "least ms"))
+    return Section(title, rows, (roofs_note,), {title: plot})
+
+
+def bytes_of(scene: Scene, facts: Facts) -> dict[str, int]:
+    """What each kernel must move, bytes, by name; not for those that take next to no time."""
+    raster = rasterize(scene.points_uv, scene.z, scene.radii, scene.opacities, scene.height, scene.width)
+    real, index = scene.z.element_size(), 4
+    row, number = real * facts.channels, real + index
+    entries = int(raster.lists.tile_starts[-1])
+    lists, records = 2 * real * entries, (4 * real + 2 * index) * entries
+    pixels, shown = facts.height * facts.width, facts.shown_points
+    forward = records + row * shown + (row + real) * pixels
+    sort = lists + records + 4 * real * shown
+    return {
+        "count_tiles": (5 * real + index) * facts.points,
+        "fill_tiles": number * facts.points + lists,
+        "sort_tiles": sort,
+        "sort_tiles_together": sort,
+        "composite_tiles": forward,
+        "composite_pixels": forward,
+        "clear_gradients": index * facts.points + (row + 4 * real) * (facts.points - shown),
+        "composite_tiles_backward": records + (2 * row + 4 * real) * shown + row * pixels,
+    }
+
+
+def flops_of(facts: Facts) -> dict[str, int]:
+    """Additions and multiplications that the formulas of `splat` ask of each kernel, by name; sorting has none.
+
+    A fragment's alpha takes 7 (two differences, d2, the slope), its weight and what it lets through 3, its features two
+    a channel. Backward: alpha and what it lets through 9, the weight 1, two dot products a channel, 18 for the rest.
+    """
+    pixels, fragments, channels = facts.height * facts.width, facts.fragments, facts.channels
+    forward = (10 + 2 * channels) * fragments + (1 + 2 * channels) * pixels
+    return {
+        "count_tiles": 18 * facts.points,  # the corners of the footprint 8, whether all numbers are finite 10
+        "composite_tiles": forward,
+        "composite_pixels": forward,
+        "composite_tiles_backward": (28 + 4 * channels) * fragments,
+    }
 
 
 class _Roofs:
@@ -153,36 +152,5 @@ class _Roofs:
             job.launch(_FILE, "multiply_add", defines, (self._items,), [*numbers, self._sums], (self._local,))
 
 
-def section(result: Record) -> Section:
-    """A row a kernel, the roofs below."""
-    roofs = f"roofs: {result['bandwidth'].median / 1e9:.1f} GB/s copied, {result['peak'].median / 1e9:.0f} Gflop/s"
-    notes = roofs, *busy(result["others_cores"])
-    title, columns = f"Roofline, {result['facts'].size} px", (("ms", "least ms"),)
-    return Section(title, [*_rows(result)], notes, {"rooflines": [result]}, columns)
-
-
-def _rows(result: Record) -> Iterator[Measurement]:
-    radius = f", radius {result['facts'].radius:g}"
-    for name, unit in (("bandwidth", "B/s"), ("peak", "flop/s")):
-        yield Measurement(name, "", result[name], unit, name=f"roofline {name}{radius}", better="higher")
-    least = 0.0
-    for point in result["points"]:
-        row, share, seconds = point["name"], point["share"], point["time"].median
-        moved, flops = point["moved_bytes"], point["flops"]
-        least += share.median * seconds
-        yield Measurement(row, "launches", str(point["launches"]))
-        yield Measurement(row, "ms", point["time"], "s", ".3f")
-        yield Measurement(row, "least ms", share.median * seconds, "s", ".3f")
-        yield Measurement(row, "bound by", point["bound"])
-        yield Measurement(row, "of the roof", f"{share.median:.0%} ({share.low:.0%}-{share.high:.0%})")
-        yield Measurement(row, "", share, name=f"roofline {row}{radius}", better="higher")
-        work = {"MB": moved / 1e6, "Mflop": flops / 1e6, "flop/byte": flops / moved}
-        for column, value in (work | {"GB/s": moved / seconds / 1e9, "Gflop/s": flops / seconds / 1e9}).items():
-            yield Measurement(row, column, value, digits=".1f")
-    yield Measurement("all kernels", "ms", result["kernels"], "s", ".3f")
-    yield Measurement("all kernels", "of the roof", least / result["kernels"], digits=".0%")
-    yield Measurement("no kernel running", "ms", result["between"], "s", ".3f")
-
-
 if __name__ == "__main__":
-    main(tyro.cli(RooflineBench))
+    sys.exit(main(["bench", "operators", "--roofline", *sys.argv[1:]]))

@@ -1,11 +1,13 @@
 """What is splatted: one point per pixel of the procedural street, seen from a camera further on."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import torch
 
+from vestcl.bench.common.timing import Task
 from vestcl.data import Street, intrinsics
 from vestcl.ops.displace import displace
 from vestcl.ops.splat import splat
@@ -58,6 +60,12 @@ class Scene:
     def forward(self) -> torch.Tensor:
         """vestcl's image."""
         return splat(self.points_uv, self.z, self.radii, self.opacities, self.features, self.height, self.width)[0]
+
+
+def both_passes(scene: Scene, image_of: Callable[[Scene], torch.Tensor] = Scene.forward) -> Task:
+    """Forward and backward of ``image_of``, with all gradients."""
+    recording = scene.requiring_grad()
+    return lambda: torch.autograd.grad(image_of(recording), recording.leaves, recording.grad_image)
 
 
 def street(height: int, width: int, channels: int, radius: float, seed: int = 0) -> Scene:

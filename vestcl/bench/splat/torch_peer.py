@@ -113,15 +113,10 @@ def list_fragments(
     starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
     places = places[: starts[-1]]
     alphas = candidates.view(-1)[places].double()
-    transmittances = _transmittances(alphas, starts)
-    return Fragments(order, pixels, dx, dy, places, order[places // k**2], starts, alphas, transmittances)
-
-
-def _transmittances(alphas: torch.Tensor, starts: torch.Tensor) -> torch.Tensor:
-    """Step 4."""
     logs = torch.log1p(-alphas).clamp(min=_LOG_OF_ZERO)
     scan = torch.cat([logs.new_zeros(1), logs.cumsum(0)])
-    return (scan[:-1] - scan[starts[:-1]].repeat_interleave(starts.diff())).exp()
+    transmittances = (scan[:-1] - scan[starts[:-1]].repeat_interleave(starts.diff())).exp()
+    return Fragments(order, pixels, dx, dy, places, order[places // k**2], starts, alphas, transmittances)
 
 
 def splat(scene: Scene, expanding: Expand = expand) -> torch.Tensor:
@@ -141,16 +136,8 @@ class _TorchSplat(torch.autograd.Function):
     """Images [height * width, C]."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        points_uv: torch.Tensor,
-        z: torch.Tensor,
-        radii: torch.Tensor,
-        opacities: torch.Tensor,
-        features: torch.Tensor,
-        size: tuple[int, int],
-        expanding: Expand,
-    ) -> torch.Tensor:
+    def forward(ctx: Any, *arguments: Any) -> torch.Tensor:
+        points_uv, z, radii, opacities, features, size, expanding = arguments
         ctx.fragments = list_fragments(size, points_uv, z, radii, opacities, expanding)
         ctx.save_for_backward(radii, opacities, features)
         return _bag(features, ctx.fragments.points, ctx.fragments.starts, ctx.fragments.weights)

@@ -2,37 +2,48 @@
 
 Each case runs twice on the same numbers, in float32 and in float64, forward and backward. The error of an array is
     max |a - b| / max |b|,   a in float32, b in float64:
-the maximum norm, over image or coverage (or displacement), and over the gradient of each input separately. Its bounds
-are from vestcl.bench.stability.bounds, and the errors of others from vestcl.bench.stability.peers.
+the maximum norm, over image or coverage (or displacement), and over the gradient of each input separately. Its bounds,
+and others' operators, are from vestcl.bench.stability.operators.
 """
 
 import contextlib
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 
+import pandas as pd  # type: ignore[import-untyped]
 import torch
 from rich.console import Console
 
 from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common.options import Options
-from vestcl.bench.common.plots import Curve, curves, file_name
+from vestcl.bench.common.plots import Curve, curves
 from vestcl.bench.common.table import Measurement, Section
-from vestcl.bench.common.timing import Spread
-from vestcl.bench.stability.bounds import UNIT, bounds_of
-from vestcl.bench.stability.cases import FAMILIES, Case, Family
-from vestcl.bench.stability.peers import LEFT_OUT, peers_of
-from vestcl.bench.stability.programs import OPERATORS, Errors, evaluate, relative_errors
+from vestcl.bench.stability.cases import FAMILIES, Case, Family, Inputs
+from vestcl.bench.stability.operators import OPERATORS, Operators, noisy_operators, peers_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Runs with noise, and the bound in units of the worst of them: a maximum differs less from draw to draw.
+_DRAWS: Final = 3
+_SAFETY: Final = 3.0
+
+Outcome = dict[str, Inputs]
+"""What a program computes: "outputs" ("image" and "coverage", or "displacement_xyz") and "gradients" by input."""
+
+Errors = dict[str, dict[str, float]]
+"""A relative error for each array of an `Outcome`."""
+
 
 Row = dict[str, Any]
-"""A case: "kept", "broken", "family", "knob", "errors", "bounds", and "peers" (errors by name)."""
+"""A case: "broken" (arrays), "errors", "bounds", and "peers" (errors by name)."""
 
 _NORM: Final = "Errors are max |float32 - float64| / max |float64| over each array; shown is the worst array's."
 
-NOTES: Final = {
+_ABOUT: Final = {
     "dividing": "dividing: the same, in float32, by a backward that divides by 1 - alpha + 1e-9, as PyTorch3D's does.",
     "clamping": "clamping: alpha <= 0.99, T by division, as in 3D Gaussian Splatting; grad_backgrounds left out.",
     "R x + t - x": "R x + t - x: the rigid flow as the difference that it is.",
@@ -73,25 +84,29 @@ def main(config: StabilityBench) -> int:
     for name in config.families:
         if name not in known:
             raise ValueError(f"`families` must be of {', '.join(known)}, got {name}")
-    families = [known[name] for name in config.families] or list(FAMILIES)
+    broken = dict[str, list[str]]()
 
     def measure(_: opencl.Session, console: Console) -> Iterator[Section]:
-        for family in families:
+        for family in [known[name] for name in config.families] or FAMILIES:
             with console.status(family.name):
-                rows = [measure_case(case, config.peers) for case in family.cases(config.seed, config.quick)]
-            yield section(family, rows)
+                rows = {case: measure_case(case, config.peers) for case in family.cases(config.seed, config.quick)}
+            broken.update({case.name: row["broken"] for case, row in rows.items()})
+            cells = [cell for case, row in rows.items() for cell in _cells(case, row)]
+            title = f"{family.name}: relative error of float32 over the {family.knob}"
+            notes = (
+                _NORM,
+                *(_ABOUT[name] for name in dict.fromkeys(name for row in rows.values() for name in row["peers"])),
+            )
+            yield Section(title, cells, notes, {family.name: partial(draw, family)})
 
-    results = _results.run("stability", config, measure)
-    for number, result in enumerate(results):
-        if config.plots is not None:
-            draw(result.details["rows"], config.plots, f"{number} " if len(results) > 1 else "")
-    console, rows = _results.console(), [row for result in results for row in result.details["rows"]]
-    broken = [f"{row['family']} {row['knob']:g}: {', '.join(row['broken'])}" for row in rows if row["broken"]]
-    for line in broken:
-        console.print(f"[red]bound broken[/]: {line}", soft_wrap=True, highlight=False)
-    if not broken:
-        console.print(f"[green]all bounds kept[/] in {len(rows)} cases", highlight=False)
-    return 1 if broken else 0
+    _results.run("stability", config, measure)
+    console = _results.console()
+    for name, arrays in broken.items():
+        if arrays:
+            console.print(f"[red]bound broken[/]: {name}: {', '.join(arrays)}", soft_wrap=True, highlight=False)
+    if not any(broken.values()):
+        console.print(f"[green]all bounds kept[/] in {len(broken)} cases", highlight=False)
+    return 1 if any(broken.values()) else 0
 
 
 def measure_case(case: Case, peers: bool = True) -> Row:
@@ -99,15 +114,14 @@ def measure_case(case: Case, peers: bool = True) -> Row:
     with _float64():
         truth = evaluate(case, OPERATORS, torch.float64)
         bounds = bounds_of(case, truth)
-    others = peers_of(case) if peers else {}
-    errors, *of_peers = (
-        relative_errors(evaluate(case, operators, torch.float32), truth) for operators in (OPERATORS, *others.values())
+    errors, *of_others = (
+        relative_errors(evaluate(case, operators, torch.float32), truth)
+        for operators in (OPERATORS, *(dict(peers_of(case.program)).values() if peers else ()))
     )
-    broken, peers_errors = broken_bounds(errors, bounds), dict(zip(others, of_peers, strict=True))
-    for name, left_out in LEFT_OUT.items():
-        peers_errors.get(name, {"gradients": {}})["gradients"].pop(left_out, None)
-    found = {"errors": errors, "bounds": bounds, "peers": peers_errors}
-    return {"kept": not broken, "broken": broken, "family": case.family, "knob": case.knob, **found}
+    others = dict(zip(dict(peers_of(case.program)), of_others, strict=False))
+    # The background that "clamping" lets through is not a matter of precision.
+    others.get("clamping", {"gradients": {}})["gradients"].pop("backgrounds", None)
+    return {"broken": broken_bounds(errors, bounds), "errors": errors, "bounds": bounds, "peers": others}
 
 
 def broken_bounds(errors: Errors, bounds: Errors) -> list[str]:
@@ -135,20 +149,11 @@ def _float64() -> Iterator[None]:
         yield
 
 
-def section(family: Family, rows: Sequence[Row]) -> Section:
-    """One family's table."""
-    cells = [cell for row in rows for cell in _cells(row)]
-    notes = (_NORM, *(NOTES[name] for name in dict.fromkeys(name for row in rows for name in row["peers"])))
-    details = {"norm": _NORM, "unit_roundoff": UNIT, "rows": list(rows)}
-    return Section(f"{family.name}: relative error of float32 over the {family.knob}", cells, notes, details)
-
-
-def _cells(row: Row) -> Iterator[Measurement]:
-    knob = f"{row['knob']:.4g}"
+def _cells(case: Case, row: Row) -> Iterator[Measurement]:
+    knob = f"{case.knob:.4g}"
     for kind, label in _KINDS.items():
         array = worst(row["errors"][kind])
-        name = f"{row['family']} {row['knob']:g}, {label}"
-        yield Measurement(knob, label, row["errors"][kind][array], digits=".1e", name=name)
+        yield Measurement(knob, label, row["errors"][kind][array], digits=".1e", name=f"{case.name}, {label}")
         if kind == "gradients":
             yield Measurement(knob, "of", array)
         yield Measurement(knob, f"{label} bound", row["bounds"][kind][array], digits=".1e")
@@ -158,42 +163,116 @@ def _cells(row: Row) -> Iterator[Measurement]:
             yield Measurement(knob, f"{peer} {label}", errors[kind][worst(errors[kind])], digits=".1e")
 
 
-def worst(errors: Mapping[str, float | None]) -> str:
-    """The array with the largest error; None is infinity, as JSON has it."""
-    return max(errors, key=lambda name: math.inf if (error := errors[name]) is None else error)
+def worst(errors: Mapping[str, float]) -> str:
+    """The array with the largest error."""
+    return max(errors, key=lambda name: errors[name])
 
 
-def draw(rows: Sequence[Mapping[str, Any]], folder: Path, prefix: str = "") -> None:
-    """Write a PNG a family: errors, bounds and peers over the knob; a knob of 0 is a tenth of the least other one.
+def draw(family: Family, frame: pd.DataFrame, _: str) -> "Figure":
+    """Errors, bounds and peers over the knob; a knob of 0 is drawn at a tenth of the least other one."""
+    knobs = frame["row"].astype(float)
+    zero = knobs[knobs > 0].min() / 10
+    own = frame.assign(x=knobs.mask(knobs == 0, zero), y=frame["median"].clip(*_LIMITS))
+    label = f"{family.knob}{f' (0 is drawn at {zero:.2g})' if (knobs == 0).any() else ''}"
+    title = f"{family.name}: relative error of float32 against float64, maximum norm"
+    lines = [
+        Curve(str(name), [*of["x"]], [*of["y"]], "o-" if name in _KINDS.values() else "o--")
+        for name, of in own.dropna(subset="median").groupby("column", sort=False)
+    ]
+    return curves(title, label, {"relative error": lines})
+
+
+# ---------------------------------------------------------------- programs
+
+
+def evaluate(case: Case, operators: Operators, dtype: torch.dtype) -> Outcome:
+    """Run a case forward and backward.
 
     Args:
-        rows: of the results' ``details["rows"]``.
-        folder: made where it does not exist.
-        prefix: of the files' names.
+        case: whose inputs are rounded to ``dtype``.
+        operators: that compute.
+        dtype: float32 or float64.
 
-    Raises:
-        ValueError: the folder can't be made.
+    Returns:
+        Outputs, and gradients of the sum of outputs times weights that are uniform in [-1, 1] and exact in float32.
     """
-    for family in FAMILIES:
-        own = [row for row in rows if row["family"] == family.name]
-        zero = min((row["knob"] for row in own if row["knob"]), default=1.0) / 10
-        values: dict[str, list[Spread]] = {}
-        for row in own:
-            for kind, label in _KINDS.items():
-                array = worst(row["errors"][kind])
-                found = {"vestcl": row["errors"][kind][array], "bound": row["bounds"][kind][array]}
-                found |= {peer: errors[kind][worst(errors[kind])] for peer, errors in row["peers"].items()}
-                for name, error in found.items():
-                    values.setdefault(f"{name}, {label}", []).append(_spread(error))
-        if own:
-            knobs = [row["knob"] or zero for row in own]
-            lines = [Curve(name, knobs, of, dashed=not name.startswith("vestcl")) for name, of in values.items()]
-            title = f"{family.name}: relative error of float32 against float64, maximum norm"
-            label = f"{family.knob}{f' (0 is drawn at {zero:.2g})' if zero in knobs else ''}"
-            curves(folder / file_name(f"{prefix}{family.name}"), title, label, "relative error", lines)
+    inputs = {name: value.to(dtype) for name, value in case.inputs.items()}
+    for name in case.differentiated:
+        inputs[name].requires_grad_()
+    outputs = _PROGRAMS[case.program](case, operators, inputs)
+    generator = torch.Generator().manual_seed(case.seed)
+    gradients = torch.autograd.grad(
+        list(outputs.values()),
+        [inputs[name] for name in case.differentiated],
+        [(2 * torch.rand(of.shape, generator=generator).double() - 1).to(dtype) for of in outputs.values()],
+        allow_unused=True,
+        materialize_grads=True,
+    )
+    values = {name: output.detach() for name, output in outputs.items()}
+    return {"outputs": values, "gradients": dict(zip(case.differentiated, gradients, strict=True))}
 
 
-def _spread(error: float | None) -> Spread:
-    """An error as it is drawn; None is infinity, as JSON has it."""
-    value = _LIMITS[1] if error is None else min(max(error, _LIMITS[0]), _LIMITS[1])
-    return Spread(value, value, value, 1)
+def bounds_of(case: Case, truth: Outcome) -> Errors:
+    """The largest errors that roundings of float32 explain, array by array.
+
+    Args:
+        case: whose program ran.
+        truth: its outcome in float64.
+    """
+    operators = noisy_operators(torch.Generator().manual_seed(case.seed))
+    draws = [relative_errors(evaluate(case, operators, torch.float64), truth) for _ in range(_DRAWS)]
+    return {
+        kind: {name: _SAFETY * max(draw[kind][name] for draw in draws) for name in arrays}
+        for kind, arrays in truth.items()
+    }
+
+
+def relative_errors(got: Outcome, truth: Outcome) -> Errors:
+    """`relative_error` array by array."""
+    return {kind: {name: relative_error(got[kind][name], of) for name, of in truth[kind].items()} for kind in truth}
+
+
+def relative_error(got: torch.Tensor, wanted: torch.Tensor) -> float:
+    """max |got - wanted| / max |wanted| over a whole array: the maximum norm.
+
+    Args:
+        got: of any precision.
+        wanted: of the same shape.
+
+    Returns:
+        The error; 0 where both are equal, infinity where only ``wanted`` is 0 or ``got`` is not finite.
+    """
+    difference = (got.double() - wanted.double()).abs().max().item() if got.numel() else 0.0
+    if difference == 0:
+        return 0.0
+    scale = wanted.double().abs().max().item()
+    return difference / scale if scale > 0 and difference < float("inf") else float("inf")
+
+
+def _splat(case: Case, operators: Operators, inputs: Inputs) -> Inputs:
+    looks = (inputs[name] for name in ("radii", "opacities", "features"))
+    background = inputs["backgrounds"]
+    image, coverage = operators.splat(inputs["points_uv"], inputs["z"], *looks, case.height, case.width, background)
+    return {"image": image, "coverage": coverage}
+
+
+def _view(case: Case, operators: Operators, inputs: Inputs) -> Inputs:
+    """Unproject, move step by step, project, splat, in the order of the source depths."""
+    points_xyz = operators.unproject(inputs["depth"], inputs["source_K"])
+    steps = list(zip(inputs["quaternion"].split(1), inputs["translation"].split(1), strict=True))
+    for quaternion, translation in steps[:-1]:
+        points_xyz = operators.add(points_xyz, operators.rigid_flow(points_xyz, quaternion, translation))
+    displacement_xyz = operators.rigid_flow(points_xyz, *steps[-1])
+    points_uv, _ = operators.displace(points_xyz, displacement_xyz, inputs["K"], inputs["tgt_from_src"])
+    return _splat(case, operators, inputs | {"points_uv": points_uv, "z": inputs["depth"].detach().reshape(1, -1)})
+
+
+def _flow(case: Case, operators: Operators, inputs: Inputs) -> Inputs:
+    return {"displacement_xyz": operators.rigid_flow(*(inputs[name] for name in case.differentiated))}
+
+
+_PROGRAMS: Final[dict[str, Callable[[Case, Operators, Inputs], dict[str, Any]]]] = {
+    "splat": _splat,
+    "view": _view,
+    "flow": _flow,
+}

@@ -64,7 +64,7 @@ DIFFERENTIATED: Final[dict[Program, tuple[str, ...]]] = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
     """Inputs of one program at one setting of a knob."""
 

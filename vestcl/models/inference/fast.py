@@ -1,7 +1,7 @@
 """Trained networks, faster on a CPU, for inference: the same forecasts for less time and memory traffic.
 
 oneDNN's convolutions do most of what the cores can, so compiling the networks or reordering their weights gains little
-(`vestcl.bench.network.variants` measures both). What gains: the blocks of object motion share one convolution over the
+(docs/performance.md). What gains: the blocks of object motion share one convolution over the
 frames, which all of them look at; what only losses need is dropped; encoder and refinement may compute in bfloat16;
 and a process that keeps the memory that it frees is spared its page faults.
 """
