@@ -36,6 +36,7 @@ def test_a_street_is_a_clip(clip: vestcl.Clip) -> None:
     assert len(clip) == 5 and (clip[0].height, clip[0].width) == (48, 160)
     assert repr(clip) == "Clip(street 3, procedural street, 5 frames of 48 x 160 px at 10 Hz)"
     assert len(vestcl.open("street:3?drive=road,fps=20", frames=2, **SIZE)) == 2
+    assert clip[0].right is not None and vestcl.open("street:3?depth=motion", frames=2, **SIZE)[0].right is None
     with pytest.raises(ValueError, match="is a street, which takes height, width, frames, not fov"):
         vestcl.open("street:3", fov=60)
 

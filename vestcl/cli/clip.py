@@ -10,9 +10,6 @@ from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
 from vestcl.forecasting.network.later_frames import ClassesOf, DepthOf
 
-#: A street's size in pixels if none is asked for: SPEC section 10.
-STREET_SIZE: Final = (256, 832)
-
 #: Options that are passed on to the clip's reader, which knows whether it has them.
 _LAYOUT: Final = ("fov", "rig", "sequence", "snippet", "variant", "accumulated_depth")
 
@@ -58,7 +55,7 @@ def open_clip(
             raise ValueError(f"{text}: is a street, which takes height, width, not {', '.join(wrong)}")
         if street.driven.depth or street.driven.masks:
             raise ValueError(f"{text}: must have no depth and masks here; `vestcl prepare` takes them")
-        height, width = (given or default for given, default in zip(size, STREET_SIZE, strict=True))
+        height, width = (given or default for given, default in zip(size, street_input.DEFAULT_SIZE, strict=True))
         clip = street_input.clip(street.seeds[0], street.driven, street_frames, (height, width))
         return with_estimates(clip, estimators)
     checks.check_folders(options)

@@ -6,27 +6,23 @@ future["right"][3].image          # [3, H, W], the frame at t+3 as the right cam
 future.save("out")
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from vestcl.data import street_clip
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
 from vestcl.forecasting.future import Future
+from vestcl.forecasting.progress import Progress
 from vestcl.forecasting.result import Forecast, View
 from vestcl.forecasting.views import parse_views
 
 if TYPE_CHECKING:
     from vestcl.models.forecaster import Forecaster
 
-#: Frames of a street if no number is asked for, and its size (height, width), px.
+#: Frames of a street if no number is given.
 STREET_FRAMES: Final = 12
-STREET_SIZE: Final = (256, 832)
-
-Progress = Callable[[str, float], None]
-"""Called with the stage and the share of the work that is done, 0 to 1."""
 
 
 def open(
@@ -59,17 +55,13 @@ def open(
     if street is not None and street.seeds is not None:
         if options:
             raise ValueError(f"{text}: is a street, which takes height, width, frames, not {', '.join(options)}")
-        return _street(street.seeds[0], street.driven, frames or STREET_FRAMES, height, width)
+        default_height, default_width = street_input.DEFAULT_SIZE
+        size = (height or default_height, width or default_width)
+        made = street_input.clip(street.seeds[0], street.driven, frames or STREET_FRAMES, size)
+        return street_input.perceived(made, street.driven.drawn(street.seeds[0]))
     if frames is not None:
         raise ValueError(f"`frames` is of streets, got {frames} for {text}; take a slice of the clip, clip[:{frames}]")
     return open_sequence(source, **options).fitted(height, width)
-
-
-def _street(seed: int, driven: street_input.Driven, frames: int, height: int | None, width: int | None) -> Clip:
-    made, start = street_input.street(seed, driven)
-    fps = float(driven.drawn(seed).fps or street_input.DEFAULT_RATE)
-    size = (height or STREET_SIZE[0], width or STREET_SIZE[1])
-    return street_clip(made, frames, *size, start=start, fps=fps)
 
 
 def forecast(

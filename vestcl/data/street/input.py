@@ -27,6 +27,9 @@ ALL_RATES: Final = (0.1, 240.0)
 #: Frames per second without any given.
 DEFAULT_RATE: Final = 10.0
 
+#: Height and width of a street in pixels if none is given: SPEC section 10.
+DEFAULT_SIZE: Final = (256, 832)
+
 #: With random driving, a street's clip starts somewhere in its first minute, so that all phases of its sway come up.
 STARTS: Final = (0.0, 60.0)
 

@@ -16,6 +16,7 @@ from vestcl.forecasting.geometric.frame_cloud import FrameCloud
 from vestcl.forecasting.geometric.memory import MEMORY, SceneMemory, remember
 from vestcl.forecasting.geometric.paths import Paths, forecast_cameras, point_paths
 from vestcl.forecasting.geometric.render import Shown, holes, rendered, show
+from vestcl.forecasting.progress import Progress, by_stage
 from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.scene.exposure import as_exposed
 from vestcl.scene.inpainting.holes import deep_holes, fill_holes
@@ -28,8 +29,6 @@ METHOD: Final = "geometric"
 #: The source camera looks along the road, whose vanishing point a view shows unless it is turned away from it: by 60
 #: degrees.
 _AHEAD: Final = 0.5
-
-Progress = Callable[[str, float], None]
 
 
 def forecast_clip(
@@ -59,13 +58,7 @@ def forecast_clip(
     Raises:
         ValueError: no such frame or none before it, no steps, no views, or a clip without a source of depth.
     """
-    done, total = [0.0], _stages(index, memory) + steps * len(views)
-
-    def report(stage: str) -> None:
-        if progress:
-            progress(stage, min(done[0] / total, 1.0))
-        done[0] += 1
-
+    report = by_stage(progress, _stages(index, memory) + steps * len(views))
     return forecast_frames(Perception(clip, report, inpaint=inpaint), index, steps, views, memory=memory, report=report)
 
 

@@ -15,6 +15,7 @@ from vestcl.forecasting.geometric.paths import point_paths
 from vestcl.forecasting.network.backtest import choose_parts
 from vestcl.forecasting.network.input import NetworkInput
 from vestcl.forecasting.network.learned import REFINEMENT, CorrectedPaths, Learned, chosen_motion, given_input, refined
+from vestcl.forecasting.progress import Progress, by_stage
 from vestcl.forecasting.result import Forecast, Rendered, SkippedWork, View
 from vestcl.models.config import ModelConfig
 from vestcl.models.forecaster import Forecaster, Mode, Perceive, RenderedView
@@ -22,8 +23,6 @@ from vestcl.models.inference.skipping import Count, Tally, count_skips
 from vestcl.models.inference.stage_times import watching, with_rest
 from vestcl.scene.inpainting.inpainters import Inpainter
 from vestcl.scene.perception import Perception
-
-Progress = Callable[[str, float], None]
 
 #: Stages of a forecast that `Perception` reports: results for two frames, and the image before them.
 _STAGES = 13
@@ -63,13 +62,7 @@ def forecast_clip(
         ValueError: no such frame or none before it, no steps, no views, or a clip without a source of depth.
     """
     composed = _is_composed(model.config, mode, learned)
-    done, total = [0], _STAGES + (steps * len(views) if composed else 0)
-
-    def report(stage: str) -> None:
-        if progress:
-            progress(stage, min(done[0] / total, 1.0))
-        done[0] += 1
-
+    report = by_stage(progress, _STAGES + (steps * len(views) if composed else 0))
     how: dict[str, Any] = {"mode": mode, "perceive": perceive, "learned": learned, "report": report}
     return forecast_frames(Perception(clip, report, inpaint=inpaint), model, index, steps, views, **how)
 
