@@ -12,26 +12,29 @@ import tyro
 from vestcl.evaluation.st_lpips import Option as StLpipsOption
 
 
-@dataclass(frozen=True)
-class Devices:
-    """List the OpenCL devices of this machine."""
+@dataclass(frozen=True, kw_only=True)
+class CommonOptions:
+    """Options of every command."""
 
     threads: int | None = None
     """CPU threads of torch, OpenCV and PoCL. Default: as many as there are cores."""
 
 
 @dataclass(frozen=True)
-class Doctor:
+class Devices(CommonOptions):
+    """List the OpenCL devices of this machine."""
+
+
+@dataclass(frozen=True)
+class Doctor(CommonOptions):
     """Try every OpenCL device, each in a separate process, and print the remedy for what does not work."""
 
     timeout: float = 120.0
     """Seconds that a device may take."""
-    threads: int | None = None
-    """CPU threads of torch, OpenCV and PoCL. Default: as many as there are cores."""
 
 
 @dataclass(frozen=True)
-class Demo:
+class Demo(CommonOptions):
     """Render a procedural street, forecast it and show it from another camera."""
 
     out: Path = Path("out")
@@ -46,14 +49,12 @@ class Demo:
     """vest-s, a .safetensors file, a checkpoint's folder, or geometric. Default: vest-s, where it is installed."""
     quality: Literal["exact", "balanced", "fast"] = "balanced"
     """Inference preset of the network."""
-    threads: int | None = None
-    """CPU threads of torch, OpenCV and PoCL. Default: as many as there are cores."""
     device: str | None = None
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClipOptions:
+class ClipOptions(CommonOptions):
     """Options to open a clip, and the sources of depth, classes and inpainted background."""
 
     fov: float | None = None
@@ -85,8 +86,6 @@ class ClipOptions:
     """Cityscapes: name of the annotated frame, if there are several."""
     variant: str | None = None
     """Virtual KITTI: clone, fog ..., if there are several."""
-    threads: int | None = None
-    """CPU threads of torch, OpenCV and PoCL. Default: as many as there are cores."""
 
 
 @dataclass(frozen=True)

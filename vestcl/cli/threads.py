@@ -38,31 +38,38 @@ def settle(arguments: Sequence[str]) -> None:
 
 def asked_for(arguments: Sequence[str]) -> int | None:
     """The value of ``--threads``; None without it, and for what is not a whole number of 1 or more."""
-    for index, argument in enumerate(arguments):
-        name, equals, value = argument.partition("=")
-        if name == OPTION:
-            text = value if equals else next(iter(arguments[index + 1 : index + 2]), "")
-            return int(text) if text.isdecimal() and int(text) > 0 else None
-    return None
+    _, texts = _split(arguments)
+    return int(texts[0]) if texts and _is_count(texts[0]) else None
 
 
 def without_option(arguments: Sequence[str]) -> list[str]:
     """The command line without ``--threads N``, for commands that do not declare it.
 
     Raises:
-        ValueError: no number of 1 or more.
+        ValueError: not a number of 1 or more.
     """
-    kept, rest = list[str](), list(arguments)
+    kept, texts = _split(arguments)
+    for text in texts:
+        if not _is_count(text):
+            raise ValueError(f"{OPTION} must be 1 or more, got {text or 'nothing'}")
+    return kept
+
+
+def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The arguments without the option, and its values."""
+    kept, texts, rest = list[str](), list[str](), list(arguments)
     while rest:
         argument = rest.pop(0)
         name, equals, value = argument.partition("=")
         if name != OPTION:
             kept.append(argument)
-            continue
-        text = value if equals else (rest.pop(0) if rest else "")
-        if not (text.isdecimal() and int(text) > 0):
-            raise ValueError(f"{OPTION} must be 1 or more, got {text or 'nothing'}")
-    return kept
+        else:
+            texts.append(value if equals else (rest.pop(0) if rest else ""))
+    return kept, texts
+
+
+def _is_count(text: str) -> bool:
+    return text.isdecimal() and int(text) > 0
 
 
 def apply(count: int | None) -> None:

@@ -5,7 +5,6 @@ DIR/page/VIEW/000001_*.jpg  what the page shows beyond the forecast's own images
 DIR/side_by_side.mp4        frames seen, then the forecast at natural speed, then its last frame held
 """
 
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +13,6 @@ import jinja2
 import numpy as np
 from markupsafe import escape
 from numpy.typing import NDArray
-from PIL import Image
 
 from vestcl.data.sample import Clip
 from vestcl.forecasting.files import CONTEXT, FPS
@@ -22,6 +20,7 @@ from vestcl.forecasting.result import Forecast, View
 from vestcl.forecasting.views import seen_by
 from vestcl.io.atomic import write_bytes
 from vestcl.io.contact_sheet import Cell, Picture, depth_map, heat, rgb, sheet
+from vestcl.io.images import write_pixels
 from vestcl.io.video.writing import write_mp4
 
 PAGE: Final = "index.html"
@@ -125,14 +124,8 @@ def _files(
     files = {"forecast": f"{view}/{step:06}.png"}
     for kind, pixels in shown.items():
         files[kind] = f"page/{view}/{step:06}_{kind}.jpg"
-        _write_jpeg(out / files[kind], pixels)
+        write_pixels(out / files[kind], pixels)
     return files
-
-
-def _write_jpeg(path: Path, pixels: Picture) -> None:
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "jpeg", quality=90)
-    write_bytes(path, file.getvalue())
 
 
 def _table(methods: Mapping[str, Any], step: int) -> str:
