@@ -47,3 +47,7 @@ HOST_POOL_BYTES: Final = 1 << 29
 #: Depth of the sky, metres: so far that driving 5 m on shifts it by less than half a pixel of a 1242 pixels wide
 #: image, so that in effect it only turns (SPEC section 3.5).
 SKY_DEPTH: Final = 10_000.0
+
+#: Frames are perceived and splatted at this width, px, where they are wider and nothing else is asked for;
+#: docs/performance.md has the figures.
+WORK_WIDTH: Final = 960

@@ -11,7 +11,8 @@ from geometric_scenes import HEIGHT, WIDTH, Matrix, decibels, drive, move, point
 
 from vestcl.data import intrinsics
 from vestcl.data.sample import Clip
-from vestcl.forecasting.geometric.forecast import METHOD, forecast_clip, forecast_frames, frame_clouds, show_frame
+from vestcl.forecasting.geometric.clouds import frame_clouds
+from vestcl.forecasting.geometric.forecast import METHOD, forecast_clip, forecast_frames, show_frame
 from vestcl.forecasting.geometric.paths import point_paths
 from vestcl.forecasting.geometric.render import holes, show
 from vestcl.forecasting.result import Forecast, View

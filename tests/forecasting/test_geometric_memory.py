@@ -12,7 +12,8 @@ import pytest
 from geometric_scenes import HEIGHT, WIDTH, Floats, K, Matrix, decibels, drive, noise, turned
 
 from vestcl.forecasting.geometric import memory
-from vestcl.forecasting.geometric.forecast import _static, forecast_frames
+from vestcl.forecasting.geometric.clouds import _static
+from vestcl.forecasting.geometric.forecast import forecast_frames
 from vestcl.forecasting.geometric.memory import SceneMemory, remember
 from vestcl.forecasting.geometric.render import HOLE, Shown, holes, show
 from vestcl.forecasting.result import Forecast, View

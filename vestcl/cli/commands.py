@@ -9,6 +9,7 @@ from typing import Literal
 
 import tyro
 
+from vestcl.constants import WORK_WIDTH
 from vestcl.evaluation.st_lpips import Option as StLpipsOption
 
 
@@ -136,6 +137,9 @@ class Forecast(ClipOptions):
     """Pixels. Default: the clip's, or in proportion to --width."""
     width: int | None = None
     """Pixels. Default: the clip's, or in proportion to --height."""
+    work_width: int = WORK_WIDTH
+    """Perceive the scene at no more than this width in pixels, and show it at the size of the clip; 0: the clip's own
+    width. Smaller is faster."""
     memory: int | None = None
     """Geometric forecast only: frames before t-1 whose static scene fills what frames t and t-1 do not show; 0: none.
     Default: 3."""

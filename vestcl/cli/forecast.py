@@ -172,7 +172,8 @@ def _forecast(
     """By the network, or without one the geometric forecast."""
     stages.show("forecast", 0.0)
     asked = clip, index, options.steps, views
-    how: dict[str, Any] = {} if inpaint is None else {"inpaint": inpaint}
+    how: dict[str, Any] = {"work_width": options.work_width or None}
+    how |= {} if inpaint is None else {"inpaint": inpaint}
     if model is None or later is None:
         from vestcl.forecasting import geometric
 

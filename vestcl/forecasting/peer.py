@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from vestcl.data.sample import Clip, Sample
 from vestcl.forecasting.geometric import Perception, show_frame
-from vestcl.forecasting.geometric import forecast_frames as geometric_frames
+from vestcl.forecasting.geometric.forecast import at_recorded_size, working_frames, working_view
 from vestcl.forecasting.result import Forecast, Rendered, View
 from vestcl.models.networks.voxel_flow import MULTIPLE, VoxelFlowNetwork
 from vestcl.times import is_same
@@ -93,6 +93,7 @@ def forecast_frames(
     start = time.perf_counter()
     images = forecast_images(network, perception.image(index - 1), perception.image(index), steps)
     seconds = {"network": time.perf_counter() - start}
+    views = [working_view(perception, view) for view in views]
     others = [view for view in views if not is_source(view, clip[index])]
     shown: list[dict[str, Rendered]] = [{}] * steps
     if others:
@@ -100,7 +101,7 @@ def forecast_frames(
         shown = _shown(perception, index, images, others)
         seconds["geometry"] = time.perf_counter() - start
     frames = [{view.name: shown[k].get(view.name) or _flat(images[k]) for view in views} for k in range(steps)]
-    return Forecast(METHOD, [], frames, seconds, notes=_gap_notes(clip, index))
+    return at_recorded_size(Forecast(METHOD, [], frames, seconds, notes=_gap_notes(clip, index)), perception)
 
 
 def is_source(view: View, sample: Sample) -> bool:
@@ -120,7 +121,7 @@ def _shown(
 ) -> list[dict[str, Rendered]]:
     """Each image from ``views``, with the geometric forecast's depth, after the two frames that were really seen."""
     clip, source = perception.clip, View(_SOURCE, np.eye(4))
-    geometric = geometric_frames(perception, index, len(images), [source])
+    geometric = working_frames(perception, index, len(images), [source])
     depths = [frame[_SOURCE].depth for frame in geometric.frames]
     pairs = zip(images, depths, strict=True)
     forecast = [_sample(clip, index, step, *pair) for step, pair in enumerate(pairs, start=1)]

@@ -6,6 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.data.resize import resize_image, resize_labels
+from vestcl.forecasting.full_size import Lookup, enlarged
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -31,6 +34,21 @@ class Rendered:
     motion_xyz: NDArray[np.float32]
     """[3, H, W] m: by how much what the pixel shows moved over the last frame interval, x_(t+k) - x_(t+k-1), each in
     its own time's source camera; 0 where unknown."""
+    lookups: tuple[Lookup, ...] = ()
+    """At a working size: where colours were recorded; see `at_size`."""
+
+    def at_size(self, height: int, width: int) -> "Rendered":
+        """The view at the clip's own size: colours of the recorded images, depth and motion of the nearest pixel.
+
+        Args:
+            height: px.
+            width: px.
+        """
+        if self.image.shape[1:] == (height, width):
+            return self
+        coverage = resize_image(self.coverage, height, width)
+        depth, motion = (resize_labels(planes, height, width) for planes in (self.depth, self.motion_xyz))
+        return Rendered(enlarged(self.image, self.lookups, height, width), depth, coverage, motion)
 
 
 class SkippedWork(NamedTuple):

@@ -38,26 +38,54 @@ _GAP, _BELIEVED, _LOST = 1.5, 1.0, 0.6
 #: A bonnet is looked for in this many of the last images.
 _COMPARED: Final = 4
 
+#: The least width, px, that frames are measured at.
+LEAST_WIDTH: Final = 64
+
 _LOG: Final = logging.getLogger(__name__)
+
+
+def at_work_width(clip: Clip, width: int | None) -> Clip:
+    """``clip`` at no more than ``width`` px, in proportion; None is its own.
+
+    Raises:
+        ValueError: a width below `LEAST_WIDTH`.
+    """
+    if width is not None and width < LEAST_WIDTH:
+        raise ValueError(f"`work_width` must be {LEAST_WIDTH} px or more, got {width}")
+    return clip if width is None or clip[0].width <= width else clip.fitted(None, width)
 
 
 class Measurements(KeptResults):
     """Measurements of the frames of a clip; `vestcl.scene.perception.Perception` lists where depth comes from.
 
+    ``recorded`` is the clip as it came, ``clip`` the same at the working size, which everything measured has.
+
     Args:
         clip: at its own size.
         progress: called with the stage that begins.
+        work_width: px, the largest width that is worked at; None is the clip's own.
+
+    Raises:
+        ValueError: a width below `LEAST_WIDTH`.
     """
 
-    def __init__(self, clip: Clip, progress: Callable[[str], None] | None = None) -> None:
+    def __init__(
+        self, clip: Clip, progress: Callable[[str], None] | None = None, *, work_width: int | None = None
+    ) -> None:
         super().__init__(progress)
-        self.clip = clip
+        self.recorded, self.clip = clip, at_work_width(clip, work_width)
         self.has_labels = all(sample.labels is not None for sample in clip)
         self._empty: set[int] = set()
 
     def image(self, index: int) -> NDArray[np.float32]:
         """[3, H, W]."""
         return self.once("read", index, lambda: self.clip[index].read_image().copy())
+
+    def full_image(self, index: int) -> NDArray[np.float32] | None:
+        """[3, H', W'], the image as it was recorded; None where it has the working size."""
+        if self.recorded is self.clip:
+            return None
+        return self._part("full image", index, lambda: self.recorded[index].read_image().copy(), "read")
 
     def correspondence(self, index: int) -> Correspondence:
         """From frame ``index`` to the one before."""

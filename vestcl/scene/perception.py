@@ -43,9 +43,10 @@ class Perception(Measurements):
         progress: called with the stage that begins.
         inpaint: how the background behind the foreground is filled, as
             `vestcl.scene.inpainting.inpaint.inpaint_background` takes it; None is its default.
+        work_width: px, the largest width that is worked at; None is the clip's own.
 
     Raises:
-        ValueError: no such method of inpainting.
+        ValueError: no such method of inpainting, or a width that is too small.
     """
 
     def __init__(
@@ -54,8 +55,9 @@ class Perception(Measurements):
         progress: Callable[[str], None] | None = None,
         *,
         inpaint: str | Inpainter | None = None,
+        work_width: int | None = None,
     ) -> None:
-        super().__init__(clip, progress)
+        super().__init__(clip, progress, work_width=work_width)
         self.inpaint = inpainter(DEFAULT if inpaint is None else inpaint)
 
     def mask(self, index: int) -> NDArray[np.bool_]:

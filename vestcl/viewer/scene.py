@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from vestcl.constants import SKY_DEPTH
 from vestcl.data import calibration
 from vestcl.data.sample import Clip
-from vestcl.forecasting.geometric.forecast import frame_clouds, render_clouds
+from vestcl.forecasting.geometric.clouds import frame_clouds
+from vestcl.forecasting.geometric.forecast import render_clouds
 from vestcl.forecasting.geometric.frame_cloud import FrameCloud
 from vestcl.forecasting.geometric.memory import MEMORY, remember
 from vestcl.forecasting.result import Rendered, View

@@ -6,6 +6,7 @@ from typing import ClassVar, Final, Literal
 
 import tyro
 
+from vestcl.constants import WORK_WIDTH
 from vestcl.evaluation.st_lpips import Option as StLpipsOption
 from vestcl.models.inference.quality import Quality
 
@@ -37,9 +38,12 @@ class ForecastBench:
     last: int | None = None
     """The last window's; without it the last one that has STEPS frames after it."""
     height: int = 256
-    """Pixels of what is scored; forecasts are made at the clip's own size."""
+    """Pixels of what is scored; forecasts are shown at the clip's own size."""
     width: int = 832
     """Pixels."""
+    work_width: int = WORK_WIDTH
+    """Perceive the scene at no more than this width in pixels, and show it at the size of the clip; 0: the clip's own
+    width. Smaller is faster."""
     views: tuple[Literal["source", "right"], ...] = ("source", "right")
     """Cameras to be judged from; right only where a clip has one."""
     depth_model: str | None = None

@@ -202,7 +202,7 @@ def run_clip(
         ValueError: as `vestcl.forecasting.geometric.forecast_frames`; the clip has none of the views.
     """
     views, steps = views_of(clip, config), config.steps
-    perception = Perception(clip)
+    perception = Perception(clip, work_width=config.work_width or None)
     truth = Truth(clip, (config.height, config.width), networks.squeeze, st_lpips=networks.st_lpips)
     for index in indices:
         truth.forget(index - 1)

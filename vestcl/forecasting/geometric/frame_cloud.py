@@ -25,6 +25,8 @@ class FrameCloud:
     """[N], of the pixel that each point comes from ..."""
     columns: NDArray[np.intp]
     """[N] ... and its column."""
+    full: NDArray[np.float32] | None = None
+    """[3, H', W'], the image as it was recorded, where it is larger than ``image``."""
 
 
 @dataclass(frozen=True, eq=False)

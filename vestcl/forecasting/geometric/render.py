@@ -7,13 +7,14 @@ is exact to first order whatever the weights are. The colour is taken from there
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.forecasting.full_size import Lookup, lookup
 from vestcl.forecasting.geometric.frame_cloud import CloudPixels, FrameCloud, transposed
 from vestcl.forecasting.geometric.surface import ONE_SURFACE, SQUARED, origins, surface
 from vestcl.forecasting.result import Rendered
@@ -47,6 +48,8 @@ class Shown:
     """[7, H, W]: colour 3, inverse depth 1/m, motion 3 m."""
     coverage: NDArray[np.float32]
     """[1, H, W]."""
+    lookups: tuple[Lookup, ...] = ()
+    """Where the colours were recorded, of clouds that have a larger image; nowhere if ``where`` was given."""
 
 
 def show(
@@ -72,14 +75,16 @@ def show(
     """
     wanted = np.arange(height * width) if where is None else np.flatnonzero(where)
     planes, left = np.zeros((7, len(wanted)), np.float32), np.ones(len(wanted), np.float32)
-    uncovered = np.ones(len(wanted), np.float32)
+    uncovered, lookups = np.ones(len(wanted), np.float32), list[Lookup]()
     for cloud in clouds:
         through = left > 0
         pixels = _Requested(
             height, width, None if where is None else wanted, None if through.all() else wanted[through]
         )
-        mean, coverage = _splat(cloud, K, tgt_from_next, pixels)
+        mean, coverage, seen = _splat(cloud, K, tgt_from_next, pixels)
         opacity = np.minimum(coverage / np.float32(_OPAQUE), 1) * (coverage > HOLE)
+        if cloud.full is not None and where is None:
+            lookups.append(_lookup(cloud.full, seen, mean[:3], (left * opacity)[through], pixels))
         if pixels.coloured is None:
             mean *= left * opacity
             planes += mean
@@ -87,13 +92,16 @@ def show(
             planes[:, through] += mean * (left * opacity)[through]
         left *= 1 - opacity
         uncovered *= 1 - coverage
-    planes /= np.maximum(1 - left, np.float32(1e-6))
+    whole = np.maximum(1 - left, np.float32(1e-6))
+    planes /= whole
+    shares = [np.asarray(each.share / whole.reshape(height, width), np.float32) for each in lookups]
+    lookups = [replace(each, share=share) for each, share in zip(lookups, shares, strict=True)]
     both = np.concatenate([planes, 1 - uncovered[None]])
     if where is not None:
         some, both = both, np.zeros((8, height * width), np.float32)
         both[:, wanted] = some
     both = both.reshape(8, height, width)
-    return Shown(both[:7], both[7:])
+    return Shown(both[:7], both[7:], tuple(lookups))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +120,26 @@ class _Requested:
         return self.covered if self.coloured is None else self.coloured
 
 
+def _lookup(
+    full: NDArray[np.float32],
+    seen: NDArray[np.float32],
+    colour: NDArray[np.float32],
+    share: NDArray[np.float32],
+    pixels: _Requested,
+) -> Lookup:
+    """Of ``full`` [3, H', W'], by numbers [..., L] of the pixels whose colour is requested; 0 in the others."""
+    some = np.concatenate([seen, colour, share[None]])
+    if pixels.coloured is not None:
+        few, some = some, np.zeros((len(some), pixels.height * pixels.width), np.float32)
+        some[:, pixels.coloured] = few
+    planes = some.reshape(-1, pixels.height, pixels.width)
+    return lookup(full, planes[:3], planes[3:6], planes[6])
+
+
 def _splat(
     cloud: FrameCloud, K: NDArray[np.float64], tgt_from_next: NDArray[np.float64], wanted: _Requested
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """image [7, L], divided by coverage, and coverage [M]."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """image [7, L], divided by coverage, coverage [M], and of `_seen_at` [3, L]."""
     still = np.zeros((1, *cloud.points_xyz.shape), np.float32)
     points_uv, z = displace(
         cloud.points_xyz[None], still, K[None].astype(np.float32), tgt_from_next[None].astype(np.float32)
@@ -132,8 +156,9 @@ def _splat(
     composite, covered, pixels = image[0].transpose(1, 2, 0).reshape(-1, 16), coverage.ravel(), wanted.of_view()
     mean = transposed(composite if pixels is None else composite[pixels])
     mean /= np.maximum(covered if pixels is None else covered[pixels], np.float32(1e-6))
-    mean[:3] = _colour(mean, cloud.image, pixels, *size)
-    return mean[:7], covered if wanted.covered is None else covered[wanted.covered]
+    seen = _seen_at(mean, pixels, *size)
+    mean[:3] = _colour(mean, cloud.image, seen, wanted.width if pixels is None else _ROW)
+    return mean[:7], covered if wanted.covered is None else covered[wanted.covered], seen
 
 
 def _features(
@@ -174,40 +199,48 @@ def _some(cloud: FrameCloud, kept: NDArray[np.bool_]) -> FrameCloud:
     return FrameCloud(*moving, cloud.rows[kept], cloud.columns[kept])
 
 
-def _colour(
-    mean: NDArray[np.float32], image: NDArray[np.float32], pixels: NDArray[np.intp] | None, height: int, width: int
+def _seen_at(
+    mean: NDArray[np.float32], pixels: NDArray[np.intp] | None, height: int, width: int
 ) -> NDArray[np.float32]:
-    """[3, M]: of ``image`` where the surface was seen; where a pixel shows several, the mean of their colours.
+    """[3, L]: column and row, 0 = the first pixel's centre, of where the surface was seen; 1 if it is one, else 0.
 
-    ``mean`` is [16, M], of the ``pixels`` [M] of a view, flat; None = of all.
+    ``mean`` is [16, L], of the ``pixels`` [L] of a view, flat; None = of all.
     """
-    row, half = width, np.float32(0.5)
+    half = np.float32(0.5)
     if pixels is None:
         x = np.tile(np.arange(width, dtype=np.float32) + half, height)
         y = np.repeat(np.arange(height, dtype=np.float32) + half, width)
     else:
-        row = _ROW
         y, x = (at.astype(np.float32) + half for at in np.divmod(pixels, width))
     start, slope, seen, squared = mean[7:9], mean[9:13], mean[13:15], mean[15] * np.float32(SQUARED)
     u, v = start[0] + slope[0] * x + slope[1] * y, start[1] + slope[2] * x + slope[3] * y
     one = (u - seen[0]) ** 2 + (v - seen[1]) ** 2 < _EXTRAPOLATED**2
     one &= squared - seen[0] ** 2 - seen[1] ** 2 < ONE_SURFACE**2
+    return np.stack([u - half, v - half, one.astype(np.float32)])
+
+
+def _colour(
+    mean: NDArray[np.float32], image: NDArray[np.float32], seen: NDArray[np.float32], row: int
+) -> NDArray[np.float32]:
+    """[3, L]: of ``image`` where the surface was seen; where a pixel shows several, the mean of their colours.
+
+    ``seen`` is [3, L] of `_seen_at`; positions are looked up in rows of ``row``.
+    """
     if not mean.size:
         return mean[:3]
-    u -= half
-    v -= half
-    across, down = (np.pad(at, (0, -len(at) % row)).reshape(-1, row) for at in (u, v))
+    across, down = (np.pad(at, (0, -len(at) % row)).reshape(-1, row) for at in seen[:2])
     there = [
         cv2.remap(plane, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel() for plane in image
     ]
-    return np.where(one, np.stack(there)[:, : len(u)], mean[:3])
+    return np.where(seen[2] > 0, np.stack(there)[:, : seen.shape[1]], mean[:3])
 
 
 def rendered(shown: Shown, image: NDArray[np.float32]) -> Rendered:
     """The view as a forecast holds it, with ``image`` [3, H, W] in place of the splatted colour."""
     inverse, seen = shown.planes[3:4], shown.coverage > HOLE
     depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=seen & (inverse > 0))
-    return Rendered(image.clip(0, 1), depth, shown.coverage, np.where(seen, shown.planes[4:], np.float32(0)))
+    motion = np.where(seen, shown.planes[4:], np.float32(0))
+    return Rendered(image.clip(0, 1), depth, shown.coverage, motion, shown.lookups)
 
 
 def holes(shown: Shown) -> NDArray[np.bool_]:

@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.forecasting.geometric.forecast import forecast_frames as forecast_geometric
+from vestcl.forecasting.geometric.forecast import working_frames
 from vestcl.forecasting.geometric.paths import point_paths
 from vestcl.forecasting.network.learned import (
     CAMERA,
@@ -135,7 +135,7 @@ def _with_and_without(
     """Frame ``start`` + 1 [3, H, W] by geometry under ``motion``, without refinement and with it."""
     paths = point_paths(perception, start)
     moved = CorrectedPaths(paths.frame, paths.errors, paths.by_flow, motion.velocity_cur if motion.moves else None)
-    frames = forecast_geometric(
+    frames = working_frames(
         perception, start, 1, [_SOURCE], future_from_cur=motion.cameras, paths=moved, memory=0
     ).frames
     rendered = frames[0]["source"]

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from vestcl.constants import WORK_WIDTH
 from vestcl.data.sample import Clip
-from vestcl.forecasting.geometric.forecast import forecast_frames as forecast_geometric
-from vestcl.forecasting.geometric.forecast import input_notes
+from vestcl.forecasting.geometric.forecast import at_recorded_size, input_notes, working_frames, working_view
 from vestcl.forecasting.geometric.paths import point_paths
 from vestcl.forecasting.network.backtest import choose_parts
 from vestcl.forecasting.network.input import NetworkInput
@@ -39,6 +39,7 @@ def forecast_clip(
     perceive: Perceive | None = None,
     inpaint: Inpainter | None = None,
     learned: Learned = "tested",
+    work_width: int | None = WORK_WIDTH,
     progress: Progress | None = None,
 ) -> Forecast:
     """Forecast the frames after ``index`` of a clip, from its frames up to ``index`` only.
@@ -53,6 +54,7 @@ def forecast_clip(
         perceive: how forecast frames become inputs of mode "feedback", see `Forecaster.forecast`.
         inpaint: how the background behind the foreground of recorded frames is filled, see `Perception`.
         learned: see `forecast_frames`.
+        work_width: see `vestcl.forecasting.geometric.forecast_clip`; networks run at it, too.
         progress: called with the stage and the share of the work that is done.
 
     Returns:
@@ -64,7 +66,8 @@ def forecast_clip(
     composed = _is_composed(model.config, mode, learned)
     report = by_stage(progress, _STAGES + (steps * len(views) if composed else 0))
     how: dict[str, Any] = {"mode": mode, "perceive": perceive, "learned": learned, "report": report}
-    return forecast_frames(Perception(clip, report, inpaint=inpaint), model, index, steps, views, **how)
+    perception = Perception(clip, report, inpaint=inpaint, work_width=work_width)
+    return forecast_frames(perception, model, index, steps, views, **how)
 
 
 def forecast_frames(
@@ -107,8 +110,9 @@ def forecast_frames(
         raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
     if learned not in get_args(Learned):
         raise ValueError(f'`learned` must be "tested" or "all", got {learned!r}')
+    views = [working_view(perception, view) for view in views]
     if _is_composed(model.config, mode, learned):
-        return _composed(perception, model, index, steps, views, report)
+        return at_recorded_size(_composed(perception, model, index, steps, views, report), perception)
     given, note = _given(perception, index, model.config, steps)
     report("network")
     start = time.perf_counter()
@@ -125,9 +129,10 @@ def forecast_frames(
     skipped = what_was_skipped(tally, profile)
     seconds = perception.seconds | {"network": whole}
     notes = (*input_notes(perception, index), *([] if note is None else [note]))
-    return Forecast(
+    made = Forecast(
         model.config.name, motions, frames, seconds, profile, skipped, notes, mode or model.config.default_mode
     )
+    return at_recorded_size(made, perception)
 
 
 def _is_composed(config: ModelConfig, mode: Mode | None, learned: Learned) -> bool:
@@ -155,7 +160,7 @@ def _composed(
             parts = choose_parts(perception, model, index, known)
             motion = chosen_motion(perception, model, index, steps, parts)
         moved = CorrectedPaths(paths.frame, paths.errors, paths.by_flow, motion.velocity_cur if motion.moves else None)
-        geometric = forecast_geometric(
+        geometric = working_frames(
             perception, index, steps, views, future_from_cur=motion.cameras, paths=moved, report=report
         )
         frames = geometric.frames
@@ -224,9 +229,11 @@ def show_frame(perception: Perception, model: Forecaster, index: int, views: Seq
     """
     given, _ = _given(perception, index, model.config, 1)
     prior = given.prior if model.config.start == "prior" else None
+    views, size = [working_view(perception, view) for view in views], perception.recorded[0]
     with torch.inference_mode():
         shown = model.present(given.frame_prev, given.frame_cur, given.K, cameras(views, given), prior, given.own)
-    return dict(zip((view.name for view in views), map(_rendered, shown), strict=True))
+    frames = (_rendered(view).at_size(size.height, size.width) for view in shown)
+    return dict(zip((view.name for view in views), frames, strict=True))
 
 
 def _given(perception: Perception, index: int, config: ModelConfig, steps: int) -> tuple[NetworkInput, str | None]:
