@@ -79,7 +79,7 @@ def resize_labels(labels: NDArray[Element], height: int, width: int) -> NDArray[
     if labels.shape[1:] == (height, width):
         return labels
     rows, columns = _under_centres(labels.shape[1], height), _under_centres(labels.shape[2], width)
-    return labels[:, rows[:, None], columns]
+    return labels.take(columns, axis=2).take(rows, axis=1)
 
 
 def sample_grid(

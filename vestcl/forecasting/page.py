@@ -14,6 +14,7 @@ import numpy as np
 from markupsafe import escape
 from numpy.typing import NDArray
 
+from vestcl.data.resize import resize_labels
 from vestcl.data.sample import Clip
 from vestcl.forecasting.files import CONTEXT, FPS
 from vestcl.forecasting.result import Forecast, View
@@ -28,6 +29,9 @@ VIDEO: Final = "side_by_side.mp4"
 
 #: Seconds that the last frame of the video is held.
 HELD_SECONDS: Final = 1.5
+
+#: Images of the video are shown no wider, px.
+_WIDEST: Final = 1280
 
 #: A bar on top of each frame of the video, px, and its colours: of frames that were seen, and of forecasts.
 _BAR: Final = 6
@@ -120,7 +124,9 @@ def _files(
         truth = truths[step - 1]
         shown["truth"] = rgb(truth)
         shown["error"] = heat(np.abs(frame.image - truth).mean(axis=0, keepdims=True))
-    shown["depth"] = depth_map(frame.depth)
+    height, width = frame.depth.shape[1:]
+    smaller = min(1.0, _WIDEST / width)
+    shown["depth"] = depth_map(resize_labels(frame.depth, max(1, round(height * smaller)), round(width * smaller)))
     files = {"forecast": f"{view}/{step:06}.png"}
     for kind, pixels in shown.items():
         files[kind] = f"page/{view}/{step:06}_{kind}.jpg"
@@ -173,4 +179,4 @@ def _stacked(images: Sequence[tuple[str, NDArray[np.float32]]], label: str, colo
         pixels = rgb(image).copy()
         pixels[:_BAR] = colour
         rows.append([Cell(pixels, f"{name}: {label}")])
-    return sheet(rows, cell_width=max(image.shape[2] for _, image in images))
+    return sheet(rows, cell_width=min(_WIDEST, max(image.shape[2] for _, image in images)))

@@ -3,6 +3,7 @@
 An image here is [H, W, 3] uint8 RGB, ready for `vestcl.io.write_pixels`.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -259,8 +260,16 @@ def _font(size: int = _FONT_SIZE) -> ImageFont.FreeTypeFont | ImageFont.ImageFon
 
 def _coloured(values: NDArray[np.floating], colours: str) -> Picture:
     """[H, W], clipped to [0, 1], to [H, W, 3] by a colour map of matplotlib's."""
-    shown: Picture = np.rint(matplotlib.colormaps[colours](values.clip(0, 1))[..., :3] * 255).astype(np.uint8)
-    return shown
+    table = _table(colours)
+    levels = (values.clip(0, 1) * np.float32(len(table))).astype(np.intp)
+    return table.take(levels, axis=0, mode="clip")
+
+
+@functools.cache
+def _table(colours: str) -> NDArray[np.uint8]:
+    """[256, 3], the colours of one of matplotlib's maps."""
+    colour_map = matplotlib.colormaps[colours]
+    return np.rint(colour_map(np.arange(colour_map.N))[:, :3] * 255).astype(np.uint8)
 
 
 def _plane(name: str, value: ArrayLike) -> NDArray[np.floating]:

@@ -155,9 +155,10 @@ def read_exr_frame(path: str | Path) -> ExrFrame:
     return ExrFrame(**found)
 
 
-def linear_from_srgb(srgb: ArrayLike) -> NDArray[np.float64]:
-    """x / 12.92 up to 0.04045, ((x + 0.055) / 1.055)^2.4 above (IEC 61966-2-1)."""
-    values = np.asarray(srgb, np.float64)
+def linear_from_srgb(srgb: ArrayLike) -> NDArray[np.floating]:
+    """x / 12.92 up to 0.04045, ((x + 0.055) / 1.055)^2.4 above (IEC 61966-2-1); of float32 in float32."""
+    values = np.asarray(srgb)
+    values = values if values.dtype == np.float32 else values.astype(np.float64)
     return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
 
 

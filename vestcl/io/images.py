@@ -146,5 +146,7 @@ def to_pixels(image: ArrayLike, bits: int = 8) -> Pixels:
     if np.isnan(planes).any():
         raise ValueError("`image` must not have NaN")
     dtype = np.uint8 if bits == 8 else np.uint16
-    levels = np.rint(np.clip(planes, 0, 1) * np.float32(np.iinfo(dtype).max)).astype(dtype)
+    most = np.float32(np.iinfo(dtype).max)
+    levels = np.multiply(planes, most)
+    levels = np.rint(np.clip(levels, 0, most, out=levels), out=levels).astype(dtype)
     return np.ascontiguousarray(levels.transpose(1, 2, 0)) if len(levels) == 3 else levels[0]
