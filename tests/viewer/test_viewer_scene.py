@@ -71,6 +71,23 @@ def test_a_still_image_is_the_forecast(clip: vestcl.Clip, engine: Engine, aside:
             np.testing.assert_allclose(rendered.coverage, wanted.coverage, atol=1e-3)
 
 
+def test_a_still_image_of_a_clip_wider_than_what_is_worked_at(
+    clip: vestcl.Clip, aside: View, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vestcl.viewer.engine.WORK_WIDTH", 80)
+    engine = Engine(clip)
+    try:
+        scene = scene_of(engine, "geometric")
+        future = vestcl.forecast(clip, NOW, steps=2, views=["source", aside], work_width=80)
+        for view in (View("source", np.eye(4)), aside):
+            rendered, wanted = scene.render(2.0, view), future[view.name][2]
+            assert rendered.image.shape == wanted.image.shape == (3, SIZE["height"], SIZE["width"])
+            assert np.abs(rendered.image - wanted.image).max() <= 1 / 255
+        assert scene.render_coarse(2.0, aside, 2).image.shape == (3, SIZE["height"] // 4, SIZE["width"] // 4)
+    finally:
+        engine.close()
+
+
 def test_a_still_image_with_all_learned_parts(clip: vestcl.Clip, aside: View, monkeypatch: pytest.MonkeyPatch) -> None:
     """As if each part had passed its test; here none may."""
     chosen = {part: LearnedPart(True, "the test has it") for part in PARTS}

@@ -87,8 +87,9 @@ def forecast(
             `Forecaster`.
         quality: the inference preset of a network that is loaded here.
         progress: called with the stage and the share of the work that is done.
-        **how: ``memory`` and ``inpaint`` of `vestcl.forecasting.geometric.forecast_clip`, ``mode``, ``perceive``,
-            ``learned`` and ``inpaint`` of `vestcl.forecasting.network.forecast.forecast_clip`.
+        **how: ``work_width`` (px, the largest width that scenes are perceived at; None is the clip's own), ``inpaint``
+            and ``memory`` of `vestcl.forecasting.geometric.forecast_clip`, and ``mode``, ``perceive``, ``learned`` of
+            `vestcl.forecasting.network.forecast.forecast_clip`.
 
     Returns:
         The future: ``future["right"][3].image``.

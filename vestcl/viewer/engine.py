@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vestcl.constants import WORK_WIDTH
 from vestcl.data.sample import Clip
 from vestcl.forecasting.geometric.forecast import METHOD
 from vestcl.scene.inpainting.inpainters import Inpainter
@@ -78,7 +79,7 @@ class Engine:
         self.methods: tuple[str, ...] = (METHOD,)
         if model is not None:
             self.methods = (METHOD, self._network(preset).config.name)
-        self._perception = Perception(clip, inpaint=inpaint)
+        self._perception = Perception(clip, inpaint=inpaint, work_width=WORK_WIDTH)
         self._scenes: collections.OrderedDict[Wanted, Scene] = collections.OrderedDict()
         self._truths: collections.OrderedDict[int, NDArray[np.float32]] = collections.OrderedDict()
         self._failed: dict[Wanted, str] = {}

@@ -2,7 +2,7 @@
 
 import collections
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
@@ -56,9 +56,9 @@ class Scene:
     """
 
     def __init__(self, perception: Perception, index: int, motion: Motion, memory: int = MEMORY) -> None:
-        clip = perception.clip
+        clip, working = perception.recorded, perception.clip[index]
         self.index, self.motion, self.K = index, motion, clip[index].K
-        self.size = clip[index].height, clip[index].width
+        self.size, self._working = (clip[index].height, clip[index].width), (working.height, working.width)
         remembered = remember(perception, index, memory)
         self._clouds = frame_clouds(perception, index, motion.paths, remembered)
         self._moved: collections.OrderedDict[tuple[float, int], list[FrameCloud]] = collections.OrderedDict()
@@ -76,12 +76,11 @@ class Scene:
             ahead: intervals after t, -1 to 10; tenths of them.
             view: a camera, placed from the source camera at that time.
         """
-        K = self.K if view.K is None else view.K
-        rendered = render_clouds(self.moved(ahead), K, view, *self.size)
+        rendered = self._rendered(ahead, view, 1)
         whole = round(ahead)
-        if self.motion.refine is None or whole < 1 or whole != on_tick(ahead):
-            return rendered
-        return self.motion.refine(rendered, whole, view)
+        if self.motion.refine is not None and whole >= 1 and whole == on_tick(ahead):
+            rendered = self.motion.refine(rendered, whole, self._working_view(view, 1))
+        return rendered.at_size(*self.size)
 
     def render_coarse(self, ahead: float, view: View, stride: int) -> Rendered:
         """The view by each ``stride``-th point of rows and columns, at a size that is smaller by as much.
@@ -91,10 +90,23 @@ class Scene:
             view: as of `render`.
             stride: 1 or more.
         """
-        K = self.K if view.K is None else view.K
-        height, width = (max(side // stride, 1) for side in self.size)
-        scale = np.diag([width / self.size[1], height / self.size[0], 1.0])
-        return render_clouds(self.moved(ahead, stride), scale @ K, view, height, width)
+        return self._rendered(ahead, view, stride)
+
+    def _rendered(self, ahead: float, view: View, stride: int) -> Rendered:
+        """At the working size, or the ``stride``-th part of it."""
+        shown = self._working_view(view, stride)
+        assert shown.K is not None
+        return render_clouds(self.moved(ahead, stride), shown.K, shown, *self._working_size(stride))
+
+    def _working_size(self, stride: int) -> tuple[int, int]:
+        height, width = (max(side // stride, 1) for side in self._working)
+        return height, width
+
+    def _working_view(self, view: View, stride: int) -> View:
+        """The view with its K at `_working_size`."""
+        height, width = self._working_size(stride)
+        factors = np.diag([width / self.size[1], height / self.size[0], 1.0])
+        return replace(view, K=factors @ (self.K if view.K is None else view.K))
 
     def moved(self, ahead: float, stride: int = 1) -> list[FrameCloud]:
         """The clouds at a time, kept for the next view: all points, or every ``stride``-th of rows and columns."""
