@@ -84,7 +84,8 @@ class Table:
 # ---------------------------------------------------------------- the tables
 
 FORECAST: Final = Source(
-    "docs/results/forecast.json", "vestcl bench forecast CLIP ... --windows docs/windows.json --st-lpips FILE"
+    "docs/results/forecast.json",
+    "vestcl bench forecast CLIP ... --windows docs/windows.json --work-width 0 --st-lpips FILE",
 )
 STREETS: Final = Source(
     "docs/results/streets.json",
