@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # all load on first use, for importing torch takes seconds
     from vestcl.data.sample import Clip
     from vestcl.forecasting.api import forecast, open
     from vestcl.forecasting.future import Future
+    from vestcl.forecasting.live import Live, live
     from vestcl.models.forecaster import Forecaster
     from vestcl.opencl import DeviceError, DeviceInfo, devices, use
     from vestcl.opencl.host_memory import free_memory
@@ -30,6 +31,7 @@ __all__ = [
     "DeviceInfo",
     "Forecaster",
     "Future",
+    "Live",
     "Raster",
     "Skipped",
     "__version__",
@@ -38,6 +40,7 @@ __all__ = [
     "displace",
     "forecast",
     "free_memory",
+    "live",
     "open",
     "rasterize",
     "rigid_flow",
@@ -53,6 +56,7 @@ _FILES = {
     **dict.fromkeys(("DeviceError", "DeviceInfo", "devices", "use"), "opencl"),
     "free_memory": "opencl.host_memory",
     **dict.fromkeys(("forecast", "open"), "forecasting.api"),
+    **dict.fromkeys(("Live", "live"), "forecasting.live"),
     "Clip": "data.sample",
     "Forecaster": "models.forecaster",
     "Future": "forecasting.future",

@@ -6,7 +6,7 @@ future["right"][3].image          # [3, H, W], the frame at t+3 as the right cam
 future.save("out")
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -17,6 +17,7 @@ from vestcl.forecasting.future import Future
 from vestcl.forecasting.progress import Progress
 from vestcl.forecasting.result import Forecast, View
 from vestcl.forecasting.views import parse_views
+from vestcl.scene.perception import Perception
 
 if TYPE_CHECKING:
     from vestcl.models.forecaster import Forecaster
@@ -104,11 +105,16 @@ def forecast(
     if not 1 <= index < len(clip):
         got = f"{len(clip)} frames" if frame is None else str(frame)
         raise ValueError(f"`frame` must be 1 ... {len(clip) - 1}, to have a frame before it, got {got}")
-    cameras = _cameras(views, clip, index)
+    cameras = chosen_views(views, clip, index)
     return Future(clip, index, tuple(cameras), _made(clip, index, steps, cameras, model, quality, progress, how))
 
 
-def _cameras(views: str | Iterable[str | View], clip: Clip, index: int) -> list[View]:
+def chosen_views(views: str | Iterable[str | View], clip: Clip, index: int) -> list[View]:
+    """The cameras that ``views`` of `forecast` are at frame ``index``.
+
+    Raises:
+        ValueError: none, no such view, or two of one name.
+    """
     given = [views] if isinstance(views, str | View) else list(views)
     if not given:
         raise ValueError("`views` must be one camera or more, got none")
@@ -139,3 +145,20 @@ def _made(
 
     network_model = presets.load(model, quality) if isinstance(model, str | Path) else model
     return network.forecast_clip(clip, index, steps, views, network_model, progress=progress, **how)
+
+
+Make = Callable[[Perception, int, int, Sequence[View]], Forecast]
+"""(perception, index of the frame t, steps, views) -> forecast."""
+
+
+def forecaster(model: "str | Path | Forecaster | None", quality: Literal["exact", "balanced", "fast"]) -> Make:
+    """What forecasts from frames that were perceived before; arguments as of `forecast`."""
+    if model is None:
+        from vestcl.forecasting import geometric
+
+        return geometric.forecast_frames
+    from vestcl.forecasting.network import forecast as network
+    from vestcl.models.inference import quality as presets
+
+    loaded = presets.load(model, quality) if isinstance(model, str | Path) else model
+    return lambda perception, index, steps, views: network.forecast_frames(perception, loaded, index, steps, views)

@@ -3,13 +3,14 @@
 import logging
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.data.calibration import power
-from vestcl.data.sample import Clip
+from vestcl.data.sample import Clip, Sample
 from vestcl.io.labels import SKY
 from vestcl.scene.depth import CombinedDepth, combine_depth
 from vestcl.scene.depth.from_motion import MotionDepth, motion_depth
@@ -55,6 +56,25 @@ def at_work_width(clip: Clip, width: int | None) -> Clip:
     return clip if width is None or clip[0].width <= width else clip.fitted(None, width)
 
 
+class _Gone:
+    """The image of a frame that was dropped."""
+
+    def __init__(self, height: int, width: int) -> None:
+        self.height, self.width = height, width
+
+    def read(self) -> NDArray[np.float32]:
+        raise ValueError("the frame was dropped: only the last ones are kept")
+
+
+def _forgotten(clip: Clip, index: int) -> Clip:
+    """``clip`` without what frame ``index`` holds, if there is such a frame."""
+    if index < 0:
+        return clip
+    sample = clip[index]
+    gone = replace(sample, image=_Gone(sample.image.height, sample.image.width), depth=None, labels=None, right=None)
+    return replace(clip, samples=(*clip.samples[:index], gone, *clip.samples[index + 1 :]))
+
+
 class Measurements(KeptResults):
     """Measurements of the frames of a clip; `vestcl.scene.perception.Perception` lists where depth comes from.
 
@@ -76,6 +96,25 @@ class Measurements(KeptResults):
         self.recorded, self.clip = clip, at_work_width(clip, work_width)
         self.has_labels = all(sample.labels is not None for sample in clip)
         self._empty: set[int] = set()
+
+    def append(self, sample: Sample, *, keep: int) -> None:
+        """Take one more frame, the clip's next; what was found of earlier ones stays.
+
+        Args:
+            sample: of the clip's own size, after its last frame in time.
+            keep: how many of the last frames stay readable; those before lose their images, so that memory is bounded.
+
+        Raises:
+            ValueError: a time that does not rise.
+        """
+        recorded = replace(self.recorded, samples=(*self.recorded.samples, sample))
+        recorded.elapsed(len(recorded) - 1)
+        same = self.recorded is self.clip
+        working = sample if same else sample.resized(self.clip[0].height, self.clip[0].width)
+        clip = recorded if same else replace(self.clip, samples=(*self.clip.samples, working))
+        self.recorded, self.clip = (_forgotten(each, len(each) - 1 - keep) for each in (recorded, clip))
+        if same:
+            self.clip = self.recorded
 
     def image(self, index: int) -> NDArray[np.float32]:
         """[3, H, W]."""
