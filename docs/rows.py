@@ -1,6 +1,6 @@
 """Rows of the documentation's tables, from the contents of benches' JSON files: the heading first."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from typing import Any, Final
 
 #: Steps that tables of forecasts show.
@@ -110,6 +110,41 @@ def short(*contents: Mapping[str, Any]) -> Iterator[Row]:
             raise ValueError(f"{group['input']}: has no method {', '.join(missing)}, only {', '.join(found)}")
         label = f"{_clip(group)}; {found[names[0]]['windows']}"
         yield (label, *(_scores(found[name], ("psnr",), k) for name in names for k in STEPS))
+
+
+def work_widths(working: Mapping[str, Any], whole: Mapping[str, Any]) -> Iterator[Row]:
+    """A row per clip and method of the source view, of two files of `vestcl bench forecast --out`.
+
+    Args:
+        working: perceived at the default width.
+        whole: perceived at the clips' own; of it the geometric forecast of the same windows is one more row.
+    """
+    label = " / ".join(METRICS[metric][0] for metric in METRICS)
+    yield (f"{label}; windows", "method", *(f"t+{k}" for k in STEPS))
+    others = {group["input"]: group for group in whole["inputs"]}
+    for group in working["inputs"]:
+        found = dict(group["views"]["source"])
+        frames = {each["index"] for each in group["windows"]}
+        found["geometric, at the clip's own width"] = _mean_of(others[group["input"]], frames)
+        for number, (method, of) in enumerate(found.items()):
+            first = "" if number else f"{_clip(group)}; {of['windows']}"
+            yield (first, METHODS.get(method, method), *(_scores(of, tuple(METRICS), k) for k in STEPS))
+
+
+def _mean_of(group: Mapping[str, Any], frames: Set[int]) -> dict[str, Any]:
+    """The geometric forecast's means over some windows, as ``group["views"]`` has them over all."""
+    records = [
+        each["scores"]
+        for each in group["windows"]
+        if (each["view"], each["method"]) == ("source", "geometric") and each["index"] in frames
+    ]
+    if len(records) != len(frames):
+        raise ValueError(f"{group['input']}: must have the windows {sorted(frames)}, has {len(records)} of them")
+    means = {
+        metric: [sum(steps) / len(steps) for steps in zip(*(scores[metric] for scores in records), strict=True)]
+        for metric in METRICS
+    }
+    return {"windows": len(records), "by_horizon": means}
 
 
 def ablation(content: Mapping[str, Any]) -> Iterator[Row]:

@@ -87,6 +87,10 @@ FORECAST: Final = Source(
     "docs/results/forecast.json",
     "vestcl bench forecast CLIP ... --windows docs/windows.json --work-width 0 --st-lpips FILE",
 )
+WORKING: Final = Source(
+    "docs/results/work_width.json",
+    "vestcl bench forecast CLIP ... --windows docs/windows_8.json --model vest-s --peer FILE --st-lpips FILE",
+)
 STREETS: Final = Source(
     "docs/results/streets.json",
     "vestcl bench forecast street: --pool --first 2 --last 2 --model vest-s --st-lpips FILE",
@@ -104,6 +108,7 @@ TABLES: Final = {
     "accuracy": Table((STREETS, FORECAST), rows.short),
     "forecast-source": Table((FORECAST,), rows.clips("source")),
     "forecast-right": Table((FORECAST,), rows.clips("right")),
+    "work-width": Table((WORKING, FORECAST), rows.work_widths),
     "streets-source": Table((STREETS,), rows.methods("source")),
     "streets-right": Table((STREETS,), rows.methods("right")),
     "streets-facts": Table((STREETS,), rows.facts),

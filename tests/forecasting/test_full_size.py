@@ -1,11 +1,13 @@
 """Views at the clip's own size, of scenes perceived at a smaller one."""
 
 import functools
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+import vestcl
 from vestcl.data.resize import resize_image
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
@@ -109,6 +111,14 @@ def test_a_frame_itself_is_shown_at_the_recorded_size() -> None:
     recorded = street()[NOW].read_image()
     assert image.shape == recorded.shape
     assert np.median(np.abs(image - recorded)) < 1 / 255
+
+
+@pytest.mark.parametrize("how", [{"learned": "all"}, {"learned": "tested"}, {"mode": "feedback"}])
+def test_a_networks_forecast_has_the_clips_size(how: dict[str, Any]) -> None:
+    made = vestcl.forecast(street(), NOW, steps=2, views=["source", "0.5,0,0"], model="vest-s", work_width=208, **how)
+    for view in made:
+        assert [frame.image.shape for frame in made[view]] == [(3, *SIZE)] * 2
+        assert [frame.depth.shape for frame in made[view]] == [(1, *SIZE)] * 2
 
 
 @pytest.mark.parametrize("width", [0, 1, 63, -5])
