@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from train.command import ERRORS, failed
 from train.evaluation import report
@@ -37,7 +36,7 @@ from vestcl import __version__, interrupt, opencl
 from vestcl.bench.common import results as _results
 from vestcl.cli import command_line, options
 from vestcl.cli.prepare import shard
-from vestcl.cli.progress import ProgressBar
+from vestcl.cli.progress import progress_bar
 from vestcl.data.street import input as street_input
 from vestcl.evaluation.metrics import MS_SSIM_SIDE
 from vestcl.evaluation.perceptual import Lpips, StLpips
@@ -202,9 +201,7 @@ def _caveats(config: Evaluation, setup: Setup) -> list[str]:
 
 
 def _run(parts: Sequence[ShardPart], setup: Setup, console: Console) -> None:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = ProgressBar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal)
-    with bar:
+    with progress_bar(console, counted=True) as bar:
         task = bar.add_task("windows", total=sum(len(part.indices) for part in parts))
         for part in parts:
             bar.update(task, description=part.source.name)

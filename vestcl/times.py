@@ -92,6 +92,32 @@ def frames_after(places: NDArray[np.float64], index: int, steps: int) -> list[in
     return found
 
 
+def steps_ahead(seconds: float, interval: float | None, where: str) -> int:
+    """The whole number of intervals that is nearest to a time ahead.
+
+    Args:
+        seconds: positive.
+        interval: of the clip, seconds; None is not known.
+        where: what a message begins with.
+
+    Returns:
+        1 or more.
+
+    Raises:
+        ValueError: no positive time, less than half an interval, or a clip without timestamps.
+    """
+    if not (np.isfinite(seconds) and seconds > 0):
+        raise ValueError(f"`seconds` must be positive, got {seconds}")
+    if interval is None:
+        raise ValueError(f"{where}: has no times, so that `seconds` can't be counted in frames; give `steps`")
+    steps = round(seconds / interval + 1e-9)
+    if steps < 1:
+        raise ValueError(
+            f"{where}: has a frame every {interval:.3g} s; `seconds` must be half of it or more, got {seconds:g}"
+        )
+    return steps
+
+
 def is_same(interval: float, other: float) -> bool:
     """Whether a network that learned at one interval may be used at the other: they differ by 20 % at most."""
     return abs(interval / other - 1) <= _SAME

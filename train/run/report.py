@@ -9,13 +9,12 @@ from typing import Any, Final
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
 from train.data.windows import Batch
 from train.run.trainer import Update
 from train.settings.config import Config
-from vestcl.cli.progress import ProgressBar
+from vestcl.cli.progress import progress_bar
 from vestcl.io import contact_sheet as sheet
 from vestcl.io.atomic import write_bytes
 from vestcl.io.images import write_pixels
@@ -62,9 +61,7 @@ class Reporter:
     @contextmanager
     def bar(self, step: int) -> Iterator[None]:
         """A bar from ``step`` to the run's end."""
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        drawn = self._speaks and self.console.is_terminal
-        with ProgressBar(*columns, TimeRemainingColumn(), console=self.console, disable=not drawn) as self._bar:
+        with progress_bar(self.console, counted=True, hidden=not self._speaks, stays=True) as self._bar:
             self._task = self._bar.add_task("", total=self._config.steps, completed=step)
             try:
                 yield

@@ -111,6 +111,24 @@ def _check_remembered(options: Forecast) -> None:
         raise ValueError("`memory` is of the geometric forecast: it can't be combined with `model`")
 
 
+def _check_drive(options: Forecast) -> None:
+    if options.steps is not None and options.seconds is not None:
+        raise ValueError(
+            f"`steps` and `seconds` both say how far to forecast: give one, got {options.steps} and {options.seconds:g}"
+        )
+    if options.every is None:
+        if len(options.input) != 1:
+            got = ", ".join(options.input) or "none"
+            raise ValueError(f"`input` must be one clip, or several with --every, got {got}")
+        if options.frames is not None:
+            raise ValueError("`frames` is how long streets of a whole drive are; it needs `every`")
+        return
+    if not options.input:
+        raise ValueError("`input` must be one clip or more, got none")
+    if options.gif:
+        raise ValueError("`gif` is of a single forecast: it can't be combined with `every`")
+
+
 def check_forecast(options: Forecast) -> None:
     """Refuse options that need others.
 
@@ -119,11 +137,13 @@ def check_forecast(options: Forecast) -> None:
     """
     check_file_options(options)
     _check_remembered(options)
+    _check_drive(options)
+    scored = options.compare or options.every is not None
     for name in ("squeeze", "st_lpips"):
-        if getattr(options, name) is not None and not options.compare:
+        if getattr(options, name) is not None and not scored:
             raise ValueError(f"`{name}` is a distance to the truth; it needs `compare`")
     if options.score_size is not None:
-        if not options.compare:
+        if not scored:
             raise ValueError("`score_size` is the size that images are compared at; it needs `compare`")
         check_pixels(*options.score_size, name="`score_size`")
         if min(options.score_size) < 1:
@@ -138,17 +158,17 @@ def check_forecast(options: Forecast) -> None:
         raise ValueError("`quality` is how exactly a network computes; it needs `model`")
 
 
-def check_memory(options: Forecast, clip: "Clip", views: int) -> None:
+def check_memory(steps: int, clip: "Clip", views: int) -> None:
     """Refuse a forecast whose frames do not fit into the memory that is free.
 
     Raises:
         ValueError: they do not.
     """
     height, width = clip[0].height, clip[0].width
-    wanted = options.steps * views * height * width * _RESULT_BYTES
+    wanted = steps * views * height * width * _RESULT_BYTES
     free = _free_memory()
     if free is not None and wanted > free:
-        size = f"{options.steps} steps of {views} views of {height} x {width} px"
+        size = f"{steps} steps of {views} views of {height} x {width} px"
         raise ValueError(
             f"--steps: {size} take {wanted / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
             "take fewer steps or a smaller --height"

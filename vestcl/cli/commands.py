@@ -93,16 +93,25 @@ class ClipOptions(CommonOptions):
 class Forecast(ClipOptions):
     """Forecast the next frames of a driving clip, and show them from other cameras.
 
-    The folder OUT gets images, OpenEXR and a video of each view, and forecast.json.
+    The folder OUT gets images, OpenEXR and a video of each view, and forecast.json. With --every a whole drive is
+    forecast, frame by frame: OUT gets one video, seen | forecast | truth | error, and the scores by frame. A run that
+    was interrupted continues with the same command.
     """
 
-    input: tyro.conf.Positional[str]
+    input: tyro.conf.Positional[tuple[str, ...]]
     """A KITTI raw drive, a KITTI odometry sequence, a frame of Cityscapes, a scene of Virtual KITTI 2, a folder with
-    camera.json, a video, or street:SEED for a procedural street (street:7?drive=road,fps=25 with bends, at 25 Hz)."""
+    camera.json, transforms.json or COLMAP's text files, a video, or street:SEED for a procedural street
+    (street:7?drive=road,fps=25 with bends, at 25 Hz). With --every several of them, or folders of clips."""
     out: Path = Path("out")
     """Output folder; files of an earlier forecast are replaced one by one."""
-    steps: int = 5
-    """Frames to forecast."""
+    steps: int | None = None
+    """Frames to forecast. Default: 5."""
+    seconds: float | None = None
+    """In place of --steps: how far to forecast, rounded to whole intervals of the clip."""
+    every: int | None = None
+    """Forecast a whole drive: each EVERY-th frame that true frames follow, from --frame on (default: 3)."""
+    frames: int | None = None
+    """With --every: frames of a street. Default: 30."""
     model: str | None = None
     """Forecast by a network: vest-s, a .safetensors file, a training checkpoint's folder. Default: by geometry."""
     mode: Literal["compose", "feedback"] | None = None

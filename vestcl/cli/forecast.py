@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
 from vestcl import opencl
-from vestcl.cli import checks, commands
+from vestcl.cli import checks, commands, horizon
 from vestcl.cli.clip import load_estimators, open_clip
-from vestcl.cli.progress import ProgressBar
+from vestcl.cli.progress import ProgressBar, progress_bar
 from vestcl.clock import Clock
 from vestcl.data.sample import Clip
 from vestcl.evaluation import compare
@@ -36,12 +35,6 @@ from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 
 if TYPE_CHECKING:
     from vestcl.models.forecaster import Forecaster
-
-#: Frames of a street up to the current one where no frame is asked for: SPEC section 10.
-STREET_CONTEXT: Final = 4
-
-#: Frames of a street that is made for one forecast: a quarter of an hour.
-MOST_STREET_FRAMES: Final = 10_000
 
 #: Steps in a table of scores, so that it fits 80 letters; forecast.json has all.
 STEPS_SHOWN: Final = 5
@@ -68,7 +61,9 @@ class _Stages:
             yield lambda share: self.show(name, share)
 
     def show(self, name: str, share: float) -> None:
-        """Draw the bar again."""
+        """Draw the bar again. Where the share falls, other work begins, whose time left is estimated from then on."""
+        if share < self.bar.tasks[0].completed:
+            self.bar.reset(self.task, total=1.0)
         self.bar.update(self.task, description=name, completed=share)
 
 
@@ -80,9 +75,14 @@ def run(options: commands.Forecast) -> None:
         DeviceError: no such OpenCL device.
     """
     checks.check_forecast(options)
+    if options.every is not None:
+        from vestcl.cli import drive
+
+        drive.run(options)
+        return
+    (text,) = options.input
     console = Console()
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    bar = ProgressBar(*columns, console=console, transient=True, disable=not console.is_terminal)
+    bar = progress_bar(console)
     with opencl.use(options.device), bar:
         stages = _Stages(bar)
         with stages.stage("open the clip"):
@@ -91,22 +91,23 @@ def run(options: commands.Forecast) -> None:
             estimators = load_estimators(options.depth_model, options.mask_model)
             inpaint = None if options.inpaint is None else inpainter(options.inpaint, "inpaint")
             size = options.height, options.width
-            clip = open_clip(options.input, options, size, _street_frames(options), estimators)
+            clip = open_clip(text, options, size, horizon.street_frames(options, text), estimators)
+            steps = horizon.steps_of(options, clip.interval, text)
             chosen = options.mode, options.perceive, *estimators, inpaint
             later = None if model is None else later_frames(model.config, *chosen)
-            index = current_frame(clip, options)
+            index = horizon.current_frame(clip, options, steps)
             views = parse_views(options.view or ("source",), clip[index])
-            checks.check_memory(options, clip, len(views))
+            checks.check_memory(steps, clip, len(views))
             trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
             st_lpips = None if options.st_lpips is None else StLpips.load(options.st_lpips)
-        forecast = _forecast(clip, index, options, views, stages, inpaint, model, later)
+        forecast = _forecast(clip, index, steps, options, views, stages, inpaint, model, later)
         stages.clock.seconds |= forecast.seconds
         comparisons, rival = list[Comparison](), None
         if options.compare:
             with stages.stage("compare") as report:
                 comparisons = compare.compare(forecast, clip, index, views, trunk, report, st_lpips, options.score_size)
                 if model is not None:
-                    rival = _forecast(clip, index, options, views, stages, inpaint)
+                    rival = _forecast(clip, index, steps, options, views, stages, inpaint)
                     rivals = compare.compare(rival, clip, index, views, trunk, None, st_lpips, options.score_size)
                     comparisons = [_with_rival(*pair, rival.method) for pair in zip(comparisons, rivals, strict=True)]
         with stages.stage(forecast_files.WRITING) as report:
@@ -116,6 +117,8 @@ def run(options: commands.Forecast) -> None:
             write(options.out, timed, clip, index, views, details)
             truths = {each.view: each.truth for each in comparisons}
             page.write_page(options.out, forecast, clip, index, views, truths=truths, scores=details.scores)
+    if line := horizon.horizon_line(options, clip, steps):
+        console.print(Text(line), soft_wrap=True)
     for comparison in comparisons:
         console.print(_score_table(comparison, later))
         if rival is not None and (line := where_another_is_better(comparison, forecast.method, rival.method)):
@@ -123,45 +126,10 @@ def run(options: commands.Forecast) -> None:
     _print_end(console, forecast_files.read_forecast(options.out))
 
 
-def _street_frames(options: commands.Forecast) -> int:
-    """Frames of a street that the forecast takes, seen ones and true ones; other clips have theirs."""
-    current = STREET_CONTEXT - 1 if options.frame is None else options.frame
-    frames = current + 1 + (options.steps if options.compare else 0)
-    if frames > MOST_STREET_FRAMES and checks.one_street(options.input) is not None:
-        raise ValueError(f"`frame` must be below {MOST_STREET_FRAMES:,} in a street, got {current}")
-    return max(frames, 1)
-
-
-def current_frame(clip: Clip, options: commands.Forecast) -> int:
-    """The index t of the last frame that the forecast may see.
-
-    Without ``frame`` the clip's last one; to compare, the last one with a true frame at each of ``steps`` intervals
-    after it.
-
-    Raises:
-        ValueError: no such frame, none before it, or none after it to compare with.
-    """
-    last = len(clip) - 1
-    index = options.frame
-    if index is None:
-        whole = (
-            i for i in range(last, 0, -1) if not options.compare or len(clip.after(i, options.steps)) == options.steps
-        )
-        index = next(whole, 0)
-        if index < 1:
-            wanted = f"{options.steps + 2} frames to compare {options.steps} steps" if options.compare else "2 frames"
-            wanted += " without a gap" if last > options.steps else ""
-            raise ValueError(f"{options.input}: must have {wanted}, got {last + 1}")
-    highest = last - 1 if options.compare else last
-    if not 1 <= index <= highest:
-        why = "have a frame before it" + (" and one after it to compare with" if options.compare else "")
-        raise ValueError(f"`frame` must be 1 ... {highest}, to {why}, got {index}")
-    return index
-
-
 def _forecast(
     clip: Clip,
     index: int,
+    steps: int,
     options: commands.Forecast,
     views: list[View],
     stages: _Stages,
@@ -171,7 +139,7 @@ def _forecast(
 ) -> Forecast:
     """By the network, or without one the geometric forecast."""
     stages.show("forecast", 0.0)
-    asked = clip, index, options.steps, views
+    asked = clip, index, steps, views
     how: dict[str, Any] = {"work_width": options.work_width or None}
     how |= {} if inpaint is None else {"inpaint": inpaint}
     if model is None or later is None:
@@ -234,12 +202,14 @@ def _details(
         for name in forecast.frames[0]
     }
     scores = {name: comparison.scores for name, comparison in compared.items()} if options.compare else None
-    settings = dataclasses.asdict(options)
+    unused = ("every", "frames")  # of whole drives
+    settings = {name: value for name, value in dataclasses.asdict(options).items() if name not in unused}
+    settings |= {"input": options.input[0], "steps": len(forecast.frames)}
     if options.model is not None and later is not None:
         chosen = {**later.settings, **quality.about(options.quality or quality.USUAL)}
         chosen["learned"] = options.learned or DEFAULT_LEARNED
         settings |= chosen | shipped.about_model(options.model)
-    return forecast_files.Details(options.input, settings, scores, sheets)
+    return forecast_files.Details(settings["input"], settings, scores, sheets)
 
 
 def _score_table(comparison: Comparison, later: LaterFrames | None) -> Table:

@@ -10,14 +10,13 @@ from typing import Any, Final
 
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from vestcl import interrupt
 from vestcl.cli.checks import check_file_options, is_network_file
 from vestcl.cli.clip import open_clip
 from vestcl.cli.commands import Prepare
-from vestcl.cli.progress import ProgressBar
+from vestcl.cli.progress import progress_bar
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
 from vestcl.prepare.clip import Outcome, Report, prepare_clip
@@ -53,9 +52,7 @@ def run(options: Prepare) -> None:
     part, parts = shard(options.shard, os.environ)
     tasks = plan(options, part, parts)
     console = Console()
-    hidden = not console.is_terminal or os.environ.get("LOCAL_RANK", "0") != "0"  # one bar a terminal
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = ProgressBar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden)
+    bar = progress_bar(console, counted=True, hidden=os.environ.get("LOCAL_RANK", "0") != "0")  # one bar a terminal
     summary, done, total = Summary(), 0, sum(task.frames for task in tasks)
     with interrupt.summary(lambda: _stopped(done, total)), bar:
         shown = bar.add_task("frames", total=total)

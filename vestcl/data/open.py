@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from vestcl.data.lens import lens_of, undistorted_depth, undistorted_labels
 from vestcl.data.readers import cityscapes, folder, kitti_odometry, kitti_raw, video, virtual_kitti
-from vestcl.data.readers.files import by_name, is_present
+from vestcl.data.readers.files import by_name, is_present, natural
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.sources import DepthFile, LabelFile
 from vestcl.io.labels import LabelKind
@@ -107,10 +107,36 @@ def open_sequence(
     return clip if labels is None else _with_labels(clip, Path(labels), label_ids)
 
 
+def clips_in(path: str | Path) -> list[Path]:
+    """The clips that a path holds: itself, if it is one, or the files and folders in it that are, by name.
+
+    Args:
+        path: a clip, or a folder of clips.
+
+    Returns:
+        One or more; ``path`` itself where there is none, for `open_sequence` to refuse.
+
+    Raises:
+        ValueError: a folder that can't be read.
+    """
+    path = Path(path)
+    if _layout_of(path) is not None or not path.is_dir():
+        return [path]
+    try:
+        inside = sorted(path.iterdir(), key=lambda file: natural(file.name))
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from error
+    return [each for each in inside if not each.name.startswith(".") and _layout_of(each) is not None] or [path]
+
+
+def _layout_of(path: Path) -> _Layout | None:
+    return next((layout for layout in _LAYOUTS if layout.recognises(path)), None)
+
+
 def _recognise(path: Path) -> _Layout:
-    for layout in _LAYOUTS:
-        if layout.recognises(path):
-            return layout
+    layout = _layout_of(path)
+    if layout is not None:
+        return layout
     if not path.exists():
         raise ValueError(f"{path}: no such file or folder")
     drives = sorted(drive.name for drive in path.glob("*_drive_*") if _is_kitti_raw(drive))

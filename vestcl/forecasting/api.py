@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from vestcl import times
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
@@ -21,6 +22,9 @@ from vestcl.scene.perception import Perception
 
 if TYPE_CHECKING:
     from vestcl.models.forecaster import Forecaster
+
+#: Frames to forecast if neither steps nor seconds are given.
+DEFAULT_STEPS: Final = 5
 
 #: Frames of a street if no number is given.
 STREET_FRAMES: Final = 12
@@ -69,7 +73,8 @@ def forecast(
     clip: Clip | str | Path,
     frame: int | None = None,
     *,
-    steps: int = 5,
+    steps: int | None = None,
+    seconds: float | None = None,
     views: str | Iterable[str | View] = ("source",),
     model: "str | Path | Forecaster | None" = None,
     quality: Literal["exact", "balanced", "fast"] = "balanced",
@@ -81,7 +86,8 @@ def forecast(
     Args:
         clip: what `open` gave, or anything that it opens.
         frame: the current frame t, from 0, which has one before it; later frames are not looked at. None is the last.
-        steps: frames to forecast; step k is the clip's interval times k after t.
+        steps: frames to forecast, DEFAULT_STEPS if not given; step k is the clip's interval times k after t.
+        seconds: in place of ``steps``, how far to forecast, rounded to whole intervals of the clip.
         views: cameras: "source", "right", "left", "x,y,z,yaw=,pitch=,roll=,fov=,name=" (`vestcl.forecasting.views`),
             or `View`.
         model: None forecasts by geometry only; else a network: "vest-s", a file, a training checkpoint's folder, or a
@@ -96,7 +102,8 @@ def forecast(
         The future: ``future["right"][3].image``.
 
     Raises:
-        ValueError: no such frame or none before it, no steps, no such view or model; the message names the argument.
+        ValueError: no such frame or none before it, no steps, both ``steps`` and ``seconds``, ``seconds`` of a clip
+            without times, no such view or model; the message names the argument.
 
     Source: Yarram and Yuan, ECCV 2024; SPEC sections 2 to 6.
     """
@@ -105,6 +112,11 @@ def forecast(
     if not 1 <= index < len(clip):
         got = f"{len(clip)} frames" if frame is None else str(frame)
         raise ValueError(f"`frame` must be 1 ... {len(clip) - 1}, to have a frame before it, got {got}")
+    if steps is not None and seconds is not None:
+        raise ValueError(f"`steps` and `seconds` both say how far to forecast: give one, got {steps} and {seconds}")
+    if seconds is not None:
+        steps = times.steps_ahead(seconds, clip.interval, clip.name)
+    steps = DEFAULT_STEPS if steps is None else steps
     cameras = chosen_views(views, clip, index)
     return Future(clip, index, tuple(cameras), _made(clip, index, steps, cameras, model, quality, progress, how))
 

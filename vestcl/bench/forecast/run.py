@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 import vestcl
 from vestcl.bench.forecast.config import ForecastBench
 from vestcl.bench.forecast.windows import Facts, Group
-from vestcl.cli.progress import ProgressBar
+from vestcl.cli.progress import progress_bar
 from vestcl.data.sample import Clip
 from vestcl.evaluation import street
 from vestcl.evaluation.methods import forecasts_of
@@ -166,9 +165,7 @@ def run(groups: Sequence[Group], config: ForecastBench, networks: Networks, kept
     Raises:
         ValueError: as the readers and forecasts; a window can't be kept.
     """
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    hidden = not console.is_terminal
-    with ProgressBar(*columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden) as bar:
+    with progress_bar(console, counted=True) as bar:
         task = bar.add_task("windows", total=sum(len(chosen) for group in groups for _, chosen in group.clips))
         for group in groups:
             for clip, chosen in group.clips:
