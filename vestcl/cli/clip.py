@@ -11,7 +11,7 @@ from vestcl.data.street import input as street_input
 from vestcl.forecasting.network.later_frames import ClassesOf, DepthOf
 
 #: Options that are passed on to the clip's reader, which knows whether it has them.
-_LAYOUT: Final = ("fov", "rig", "sequence", "snippet", "variant", "accumulated_depth")
+_LAYOUT: Final = ("fov", "fps", "scale", "rig", "sequence", "snippet", "variant", "accumulated_depth")
 
 #: Options of a clip's further files, with what they are if not given.
 _FILES: Final = {"depth": None, "depth_scale": None, "labels": None, "label_ids": "trainIds"}

@@ -77,6 +77,10 @@ class ClipOptions(CommonOptions):
     inpaint: str | None = None
     """Inpainting of the background behind the foreground: regions, telea ..., or lama:FILE, LaMa's TorchScript export.
     Default: regions."""
+    fps: float | None = None
+    """Frames per second of nerfstudio's and COLMAP's images, which have no times."""
+    scale: float | None = None
+    """Metres per unit of nerfstudio's and COLMAP's poses. Default: 1."""
     rig: str | None = None
     """KITTI: colour or grey cameras."""
     accumulated_depth: bool = False

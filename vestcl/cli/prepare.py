@@ -33,7 +33,7 @@ COMBINED: Final = "combined"
 #: Options of a clip's reader, as `vestcl forecast` has them, with what they are if not given.
 _READER: Final[Mapping[str, Any]] = {
     **dict.fromkeys(("fov", "depth", "depth_scale", "labels", "depth_model", "mask_model")),
-    **dict.fromkeys(("rig", "sequence", "snippet", "variant")),
+    **dict.fromkeys(("fps", "scale", "rig", "sequence", "snippet", "variant")),
     "label_ids": "trainIds",
     "accumulated_depth": False,
 }

@@ -7,7 +7,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from vestcl.data.lens import lens_of, undistorted_depth, undistorted_labels
-from vestcl.data.readers import cityscapes, folder, kitti_odometry, kitti_raw, video, virtual_kitti
+from vestcl.data.readers import (
+    cityscapes,
+    colmap,
+    folder,
+    kitti_odometry,
+    kitti_raw,
+    nerfstudio,
+    video,
+    virtual_kitti,
+)
 from vestcl.data.readers.files import by_name, is_present, natural
 from vestcl.data.sample import Clip, Sample
 from vestcl.data.sources import DepthFile, LabelFile
@@ -65,6 +74,18 @@ _LAYOUTS: Final = (
     _Layout(
         "Virtual KITTI 2", "frames/rgb (or VARIANT/frames/rgb)", _is_virtual_kitti, virtual_kitti.open_virtual_kitti
     ),
+    _Layout(
+        "nerfstudio",
+        nerfstudio.FILE,
+        lambda path: nerfstudio.is_nerfstudio(path) and not is_present(path / "camera.json"),
+        nerfstudio.open_nerfstudio,
+    ),
+    _Layout(
+        "COLMAP",
+        f"{colmap.CAMERAS} and {colmap.IMAGES} (or sparse/0 with them)",
+        lambda path: colmap.model_folder(path) is not None and not is_present(path / "camera.json"),
+        colmap.open_colmap,
+    ),
     _Layout("folder", "camera.json, or images (then give `fov`)", _is_folder, folder.open_folder),
 )
 
@@ -82,12 +103,12 @@ def open_sequence(
 
     Args:
         path: a KITTI raw drive, a KITTI odometry sequence, a frame or folder of Cityscapes, a Virtual KITTI variant,
-            a folder with camera.json, or a video.
+            a folder with camera.json, nerfstudio's transforms.json, COLMAP's text model, or a video.
         depth: a folder of depth files with the frames' names (.png, .exr, .npy), in place of the clip's own.
         depth_scale: their units per metre; PNG needs it.
         labels: a folder of label PNGs with the frames' names, in place of the clip's own.
         label_ids: what they hold.
-        **options: of the layout's reader: ``rig``, ``sequence``, ``snippet``, ``variant``, ``fov`` ...
+        **options: of the layout's reader: ``rig``, ``sequence``, ``snippet``, ``variant``, ``fov``, ``fps`` ...
 
     Returns:
         A clip with at least one sample.

@@ -42,12 +42,14 @@ def open(
 
     Args:
         source: a KITTI raw drive, a KITTI odometry sequence, a frame of Cityscapes, a scene of Virtual KITTI 2, a
-            folder with camera.json, a video, or "street:SEED" for a procedural street, which needs no file.
+            folder with camera.json, nerfstudio's transforms.json, COLMAP's text model, a video, or "street:SEED" for a
+            procedural street, which needs no file.
         height: px; None is as the clip is, or in proportion to ``width``.
         width: px, likewise.
         frames: of a street, STREET_FRAMES if not given.
-        **options: of the reader, as `vestcl forecast` has them: ``fov`` (degrees) of a video, ``depth``, ``labels``,
-            ``rig``, ``sequence`` ... (`vestcl.data.open.open_sequence`).
+        **options: of the reader, as `vestcl forecast` has them: ``fov`` (degrees) of a video, ``fps``
+            and ``scale`` (metres per unit) of nerfstudio and COLMAP, ``depth``, ``labels``, ``rig``, ``sequence`` ...
+            (`vestcl.data.open.open_sequence`).
 
     Returns:
         Its frames in order; ``clip[3]`` is a frame, ``clip[3:8]`` a clip.
