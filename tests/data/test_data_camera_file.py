@@ -3,6 +3,7 @@ folders."""
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,10 @@ import numpy as np
 import pytest
 from data_files import write_images, write_text
 
-from vestcl.data.readers.camera_file import read_camera
+from vestcl.data.readers import folder
+from vestcl.data.readers.camera_file import SCHEMA, read_camera
 from vestcl.data.readers.folder import open_folder
+from vestcl.io.strict_json import parse_json
 
 CAMERA: dict[str, Any] = {"fx": 70.0, "fy": 71, "cx": 4.0, "cy": 3.0}
 
@@ -125,6 +128,40 @@ def mutated(rng: np.random.Generator) -> str:
         at = int(rng.integers(len(text)))
         text = text[:at] + ["", "[", "}", '"', ",", "NaN", "1e999", "\\", "\x00"][rng.integers(9)] + text[at + 1 :]
     return text
+
+
+def refusal(path: Path) -> str:
+    try:
+        read_camera(path)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+def test_the_schema_says_what_the_reader_does(tmp_path: Path) -> None:
+    """By another implementation of JSON Schema: what it accepts is read, what it refuses is refused, by key."""
+    jsonschema = pytest.importorskip("jsonschema")
+    validator = jsonschema.Draft202012Validator(SCHEMA)
+    validator.check_schema(SCHEMA)
+    path, verdicts = tmp_path / "camera.json", []
+    for seed in range(3000):
+        text = mutated(np.random.default_rng(seed))
+        try:
+            content = parse_json(text.encode())
+        except ValueError:
+            continue
+        path.write_text(text, encoding="utf-8")
+        verdicts.append(validator.is_valid(content))
+        message = refusal(path)
+        # A schema can't say that the right camera needs numbers of its own where the left lens is not 0.
+        assert verdicts[-1] == (not message) or "must have its own distortion" in message, text
+    assert sum(verdicts) > 300 and len(verdicts) - sum(verdicts) > 300
+
+
+@pytest.mark.parametrize("key", sorted(SCHEMA["properties"]))
+def test_every_key_is_documented(key: str) -> None:
+    assert re.search(rf"\b{key}\b", folder.__doc__ or "") or key in ("k2", "k4", "k5")
+    assert SCHEMA["properties"][key]["description"]
 
 
 def test_fuzz(tmp_path: Path) -> None:

@@ -297,7 +297,7 @@ def test_cameras_of_two_sizes(tmp_path: Path) -> None:
 def test_a_binary_model_names_the_remedy(tmp_path: Path) -> None:
     (tmp_path / "sparse" / "0").mkdir(parents=True)
     (tmp_path / "sparse" / "0" / "images.bin").write_bytes(b"\0")
-    with pytest.raises(ValueError, match="colmap model_converter .* --output_type TXT"):
+    with pytest.raises(ValueError, match=r"colmap model_converter .* --output_type TXT"):
         open_sequence(tmp_path)
 
 

@@ -1,11 +1,12 @@
 """camera.json: the camera of a folder's frames, read strictly. What it may hold is listed in
-vestcl/data/readers/folder.py."""
+vestcl/data/readers/folder.py, and by the JSON schema camera.schema.json next to this file."""
 
 import difflib
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 from vestcl.data import calibration, fit
 from vestcl.data.calibration import Matrix
@@ -16,27 +17,20 @@ from vestcl.io.strict_json import read_object
 #: Bytes of the largest camera.json that is read.
 _LARGEST: Final = 1 << 20
 
-_NUMBERS: Final = ("fx", "fy", "cx", "cy")
+#: The format: keys, choices and bounds come from here, and are checked below, with a line that names the key.
+SCHEMA_FILE: Final = Path(__file__).with_name("camera.schema.json")
+SCHEMA: Final[Mapping[str, Any]] = json.loads(SCHEMA_FILE.read_text(encoding="utf-8"))
+
+_KEYS: Final[Mapping[str, Mapping[str, Any]]] = SCHEMA["properties"]
+_NUMBERS: Final = tuple(SCHEMA["required"])
 _SIZE: Final = ("width", "height")
 _COEFFICIENTS: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE: Final = ("k1", "k2", "k3", "k4")
-_CAMERA: Final = (*_NUMBERS, *_SIZE, "distortion", *_COEFFICIENTS)
-_OTHERS: Final = ("pixel_centre", "fps", "depth_scale", "label_ids", "baseline", "right")
-_CHOICES: Final = {
-    "pixel_centre": ("integer", "half"),
-    "label_ids": get_args(LabelKind),
-    "distortion": ("opencv", "fisheye"),
-}
+_CAMERA: Final = tuple(_KEYS["right"]["properties"])
+_CHOICES: Final = {key: tuple(filter(None, about["enum"])) for key, about in _KEYS.items() if "enum" in about}
 
 #: The largest of each number: a hundred times what has been seen, or more.
-_MOST: Final = {
-    **dict.fromkeys(_NUMBERS, 1e6),
-    **dict.fromkeys(_SIZE, 65536),
-    **dict.fromkeys(_COEFFICIENTS, 1e4),
-    "fps": 1e5,
-    "depth_scale": 1e9,
-    "baseline": 1e4,
-}
+_MOST: Final = {key: float(about["maximum"]) for key, about in _KEYS.items() if "maximum" in about}
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +75,7 @@ def read_camera(path: str | Path) -> CameraFile:
     """
     path = Path(path)
     content = read_object(path, _LARGEST)
-    _check_keys(path, content, (*_CAMERA, *_OTHERS))
+    _check_keys(path, content, tuple(_KEYS))
     camera = _camera(path, content, content)
     right = content.get("right")
     return CameraFile(
