@@ -26,7 +26,7 @@ from train.evaluation import report
 from train.evaluation.inputs import Preprocessing, check_prepared, check_stereo, plain
 from train.evaluation.key import about_run, key_of
 from train.evaluation.leaks import training_overlap
-from train.evaluation.options import Evaluation, check_options
+from train.evaluation.options import Evaluation, check_options, models_of
 from train.evaluation.protocols import NOW_NOTE, PROTOCOLS, Protocol, Source, Where
 from train.evaluation.setup import Setup
 from train.evaluation.sheets import write_sheets
@@ -48,9 +48,6 @@ from vestcl.io.atomic import write_bytes
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.networks.voxel_flow import VoxelFlowNetwork
 from vestcl.scene.inputs import Inputs
-
-#: Columns where tables don't go to a terminal.
-WIDTH: Final = 200
 
 #: What of a protocol its published figures depend on.
 _PUBLISHED: Final = ("size", "steps", "first", "last")
@@ -87,7 +84,7 @@ def evaluate(config: Evaluation) -> None:
             check_prepared(source.opens(), protocol)
     about = about_run(config, protocol)
     parts = plan(sources, protocol, setup.steps, config.every, out / "clips", key_of(about))
-    console = _results.console(WIDTH)
+    console = _results.console()
     device = config.device or Ranks(local=local_rank()).device()
     with opencl.use(device) as session:
         if not config.merge:
@@ -142,10 +139,7 @@ def setup_of(config: Evaluation, protocol: Protocol) -> Setup:
         ValueError: two models of one name, or a file that holds something else.
         FileNotFoundError: no such file.
     """
-    names = [path.stem for path in config.model]
-    if twice := sorted({name for name in names if names.count(name) > 1 or name == GEOMETRIC}):
-        raise ValueError(f"`model` must have files with different stems, got {', '.join(twice)} again")
-    models = {path.stem: Forecaster.load(path) for path in config.model}
+    models = {name: Forecaster.load(path) for name, path in models_of(config).items()}
     trunk = None if config.squeeze is None else load_trunk("squeezenet1_0", config.squeeze)
     lpips = None if config.lpips is None else Lpips.load("alexnet", *config.lpips)
     shift_tolerant = None if config.st_lpips is None else StLpips.load(config.st_lpips)
@@ -216,7 +210,8 @@ def _results_of(
 ) -> report.EvaluationResults:
     """What the tables are made of."""
     inputs: dict[str, Mapping[str, Inputs]] = {part.source.name: read_inputs(part) or {} for part in parts}
-    leaks, unknown = training_overlap(config.model, parts, setup.steps)
+    models = models_of(config)
+    leaks, unknown = training_overlap([*models.values()], parts, setup.steps, [*models])
     perceived = {name: later.perceived for name, later in setup.later.items() if later.perceived is not None}
     names, notes = tuple(setup.models), (*_caveats(config, setup), *unknown)
     shown = setup.protocol.shown

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any, Final
 
-from train.evaluation.options import Evaluation
+from train.evaluation.options import Evaluation, models_of
 from train.evaluation.protocols import Protocol
 from train.evaluation.windows import PART_WINDOWS
 from vestcl import __version__
@@ -61,7 +61,7 @@ def about_run(config: Evaluation, protocol: Protocol) -> dict[str, Any]:
     return {
         "vestcl": __version__,
         "settings": settings | changed | effective,
-        "models": {path.stem: {"file": str(path), "sha256": _sha256(path)} for path in config.model},
+        "models": {name: {"file": str(path), "sha256": _sha256(path)} for name, path in models_of(config).items()},
         "weights": hashes,
     }
 

@@ -13,13 +13,16 @@ Sentences = tuple[str, ...]
 _LISTED: Final = 8
 
 
-def training_overlap(models: Sequence[Path], parts: Sequence[ShardPart], steps: int) -> tuple[Sentences, Sentences]:
+def training_overlap(
+    models: Sequence[Path], parts: Sequence[ShardPart], steps: int, names: Sequence[str] | None = None
+) -> tuple[Sentences, Sentences]:
     """Sentences for the tables: on models that were trained on what is evaluated, and on those that may have been.
 
     Args:
         models: files.
         parts: the windows.
         steps: that are forecast.
+        names: what tables call the models; None is their stems.
 
     Returns:
         On models whose files list frames of these windows, and on models whose files list nothing.
@@ -29,15 +32,15 @@ def training_overlap(models: Sequence[Path], parts: Sequence[ShardPart], steps: 
         ValueError: a damaged file.
     """
     leaks, unknown, clips = list[str](), list[str](), list(dict.fromkeys(part.source.name for part in parts))
-    for path in models:
+    for model, path in zip(names or [path.stem for path in models], models, strict=True):
         frames = read_trained_on(path)
         if frames is None:
-            unknown.append(f"The file of {path.stem} has no record of what it was trained on.")
+            unknown.append(f"The file of {model} has no record of what it was trained on.")
             continue
         seen = {part.source.name for part in parts if _overlap(part, frames.get(part.source.name), steps)}
-        if names := [name for name in clips if name in seen]:
-            listed = ", ".join(names[:_LISTED]) + f" and {len(names) - _LISTED} more" * (len(names) > _LISTED)
-            leaks.append(f"{path.stem} was trained on frames of {len(names)} of these {len(clips)} clips: {listed}.")
+        if shown := [name for name in clips if name in seen]:
+            listed = ", ".join(shown[:_LISTED]) + f" and {len(shown) - _LISTED} more" * (len(shown) > _LISTED)
+            leaks.append(f"{model} was trained on frames of {len(shown)} of these {len(clips)} clips: {listed}.")
     return tuple(leaks), tuple(unknown)
 
 

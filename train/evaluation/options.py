@@ -1,16 +1,26 @@
 """What `python -m train.evaluate --help` lists."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 import tyro
 
 from train.evaluation.protocols import HELD_OUT, Name
+from vestcl.evaluation.scores import FLOW, GEOMETRIC, ORACLE, REPEAT
 from vestcl.evaluation.st_lpips import Option as StLpipsOption
+from vestcl.forecasting import peer
 from vestcl.forecasting.network.later_frames import Perceived
 from vestcl.forecasting.network.learned import Learned
+from vestcl.models import shipped
 from vestcl.models.forecaster import Mode
+
+#: Names of models: they are part of table rows and of JSON keys.
+_NAME: Final = re.compile(r"\w[\w .+-]{0,59}")
+
+#: Rows that are no model's.
+_TAKEN: Final = (GEOMETRIC, REPEAT, FLOW, ORACLE, peer.METHOD)
 
 
 @dataclass(frozen=True)
@@ -20,7 +30,8 @@ class Evaluation:
     protocol: tyro.conf.Positional[Name]
     """Which clips, windows, cameras and size."""
     model: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
-    """A model's file, *.safetensors; may be repeated. Tables call it by the file's stem."""
+    """A model: vest-s, a .safetensors file, a training checkpoint's folder; may be repeated. Tables call it by the
+    file's stem (a folder's name), or by NAME in NAME=FILE."""
     data: Path | None = None
     """The data set's root, or for `clip` what `vestcl forecast` opens. `street` needs none."""
     prepared: Path | None = None
@@ -87,6 +98,42 @@ class Evaluation:
     """Write contact sheets of the best, the median and the worst window."""
     device: str | None = None
     """OpenCL device: an index of `vestcl devices` or a part of its name."""
+
+
+def models_of(config: Evaluation) -> dict[str, Path]:
+    """The models' files by the names that tables give them, in the order of the options.
+
+    Raises:
+        ValueError: two models of one name, a name that a table can't have or that another row has, or no such model.
+    """
+    found: dict[str, Path] = {}
+    for given in config.model:
+        name, path = _named(given)
+        if name in found or name in _TAKEN:
+            raise ValueError(
+                f"`model` must have files with different stems, got {name} again; NAME=FILE gives one another name"
+            )
+        found[name] = path
+    return found
+
+
+def _named(given: Path) -> tuple[str, Path]:
+    """A model's name and file. What exists is a path, whatever is in its name."""
+    text = str(given)
+    name, equals, rest = text.partition("=")
+    if equals and not given.exists():
+        if not rest:
+            raise ValueError(f"`model` must be FILE or NAME=FILE, got {text!r}")
+        if not _NAME.fullmatch(name):
+            raise ValueError(f"`model` must have a name of letters, digits, spaces and '._+-', got {name[:60]!r}")
+        return name, _file(rest)
+    return given.stem if given.suffix == ".safetensors" else given.name, _file(text)
+
+
+def _file(text: str) -> Path:
+    """The file of a shipped model's name, or of a checkpoint's folder; any other path as it is."""
+    path = Path(text)
+    return shipped.find_model(text) if text in shipped.SHIPPED or path.is_dir() else path
 
 
 def check_options(config: Evaluation) -> None:

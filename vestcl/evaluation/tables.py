@@ -1,19 +1,24 @@
 """Means over windows, and tables of them for a terminal and as Markdown."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
 from rich import box
-from rich.console import Group, RenderableType
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
 
 from vestcl.evaluation import metrics
 from vestcl.evaluation.scores import RIGHT, Record
+
+#: As wide as a first column gets on the screen before its text is wrapped, and columns around a cell there.
+_LABEL: Final = 38
+_AROUND: Final = 2
 
 Means = dict[str, list[float]]
 """By metric, a number per step."""
@@ -132,14 +137,52 @@ def horizon(step: int) -> str:
 
 
 def to_rich(grid: Grid) -> RenderableType:
-    """For the terminal; a heading's last word is below the others."""
-    table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
-    for index, heading in enumerate(grid.heading):
-        stacked = "\n".join(heading.rsplit(" ", 1))
-        table.add_column(stacked, justify="right" if index else "left", no_wrap=bool(index))
-    for row in grid.rows:
-        table.add_row(*row)
-    return Group(Text(grid.title, "bold"), table, *(Text(f"  {note}", "dim") for note in grid.notes), "")
+    """For the terminal; a heading's last word is below the others. A table that is too wide comes in parts below each
+    other, each with the first column: no cell is cut."""
+    return _Fitted(grid)
+
+
+class _Fitted:
+    """A table as wide as the console."""
+
+    def __init__(self, grid: Grid) -> None:
+        self._grid = grid
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield Text(self._grid.title, "bold")
+        for columns in self._parts(options.max_width):
+            yield self._table(columns)
+        yield from (Text(f"  {note}", "dim") for note in self._grid.notes)
+        yield ""
+
+    def _parts(self, width: int) -> Iterator[list[int]]:
+        """The columns after the first, as many at a time as there is space for, and one at least."""
+        left = min(self._width(0), _LABEL) + _AROUND
+        part, used = list[int](), left
+        for column in range(1, len(self._grid.heading)):
+            needed = self._width(column) + _AROUND
+            if part and used + needed > width:
+                yield part
+                part, used = [], left
+            part, used = [*part, column], used + needed
+        yield part
+
+    def _width(self, column: int) -> int:
+        words = [*_stacked(self._grid.heading[column]).splitlines(), *(row[column] for row in self._grid.rows)]
+        return max(map(cell_len, words), default=0)
+
+    def _table(self, columns: Sequence[int]) -> Table:
+        table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
+        table.add_column(self._grid.heading[0], max_width=_LABEL)
+        for column in columns:
+            table.add_column(_stacked(self._grid.heading[column]), justify="right", no_wrap=True)
+        for row in self._grid.rows:
+            table.add_row(row[0], *(row[column] for column in columns))
+        return table
+
+
+def _stacked(heading: str) -> str:
+    return "\n".join(heading.rsplit(" ", 1))
 
 
 def to_markdown(grid: Grid) -> str:
