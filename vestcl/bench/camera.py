@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
+from vestcl.bench.common.estimate import announced
 from vestcl.bench.common.options import JsonOption
 from vestcl.bench.common.results import console, plain, settings, write_json
 from vestcl.bench.common.table import Measurement, Section, show_grid
@@ -143,12 +144,14 @@ def _forecasts(measured: Array, seconds: Array, frames: Indices, steps: Sequence
     future = np.zeros((len(steps), len(measured), len(frames), 4, 4))
     if history is None:
         forecaster = CameraForecaster(len(measured))
-        for index in track(range(frames[-1]), "drive", transient=True):
+        passed = announced(range(frames[-1]), console(), "frames")
+        for index in track(passed, "drive", int(frames[-1]), transient=True):
             forecaster.measure(measured[:, index], intervals[index])
             if index + 1 >= frames[0]:
                 future[:, :, index + 1 - frames[0]] = forecaster.forecast(ahead)
         return future
-    for seed, motions in enumerate(track(measured, "seeds", transient=True)):
+    noises = announced(list(measured), console(), "seeds")
+    for seed, motions in enumerate(track(noises, "seeds", len(measured), transient=True)):
         forecaster = CameraForecaster(len(frames))
         for back in range(history, 0, -1):
             forecaster.measure(motions[frames - back], float(np.median(intervals)))

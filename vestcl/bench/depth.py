@@ -7,6 +7,7 @@ import numpy as np
 import tyro
 from rich.progress import track
 
+from vestcl.bench.common.estimate import announced
 from vestcl.bench.common.options import JsonOption
 from vestcl.bench.common.results import console, plain, settings, write_json
 from vestcl.bench.common.table import Measurement, Section, show_grid
@@ -104,7 +105,8 @@ def evaluate(clip: Clip, network: DepthOf | None, config: DepthBench) -> dict[st
         methods[COMBINED] = Perception(with_estimates(bare, depth=network))
     names = [MOTION] if network is None else [MOTION, NETWORK, COMBINED]
     scores: dict[str, dict[int, DepthScores]] = {name: {} for name in names}
-    for index in track(frames, clip.name, transient=True):
+    counted = announced(frames, console(), "frames")
+    for index in track(counted, clip.name, len(frames), transient=True):
         # Scans are compared where they have returns, not where they were densified.
         true = clip[index].read_depth() if clip[index].depth is not None else truth.raw_depth(index)
         found = {name: perception.raw_depth(index) for name, perception in methods.items()}

@@ -20,7 +20,7 @@ from rich.text import Text
 
 from vestcl import doctor, opencl
 from vestcl._version import __version__
-from vestcl.bench.common import plots
+from vestcl.bench.common import estimate, plots
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.table import AGAIN, Better, Section, show_grid
 from vestcl.bench.common.timing import busy_cores, is_quiet, torch_threads
@@ -88,8 +88,19 @@ class Results:
         return self.frame[self.frame["name"] != ""]
 
 
-def run(bench: str, config: Options, measure: Callable[[opencl.Session, Console], Iterator[Section]]) -> list[Results]:
+def run(
+    bench: str,
+    config: Options,
+    measure: Callable[[opencl.Session, Console], Iterator[Section]],
+    total: estimate.Total | None = None,
+) -> list[Results]:
     """`vestcl bench BENCH`: ``measure`` every device that is asked for, print section after section, write the files.
+
+    Args:
+        bench: its name.
+        config: its options.
+        measure: gives the sections of a device.
+        total: how long it takes; None is one measurement, or `vestcl.bench.common.estimate.announced` reports it.
 
     Raises:
         DeviceError: as `measure_each`.
@@ -116,7 +127,7 @@ def run(bench: str, config: Options, measure: Callable[[opencl.Session, Console]
         results.append(Results(bench, machine, settings(config), pd.concat(frames), grids))
         return results[-1]
 
-    with trace.record(config.trace), torch_threads(config.threads):
+    with trace.record(config.trace), torch_threads(config.threads), estimate.announcing(screen, total):
         found = measure_each(config.device, measured, screen)
     save(found, config.json, config.markdown)
     tell_written(screen, config.json, config.markdown, config.trace, config.plots)

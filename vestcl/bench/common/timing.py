@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from vestcl.bench.common import estimate
 from vestcl.models.inference.fast import keep_freed_memory
 
 Task = Callable[[], object]
@@ -67,8 +68,13 @@ def interleave(tasks: Mapping[str, Task], seconds: float, least: int = LEAST_ROU
         seconds: about how long the measurement takes.
         least: rounds that are run even if they take longer.
     """
-    for task in (*tasks.values(), *tasks.values()):
+    for task in tasks.values():
         task()
+    start = time.perf_counter()
+    for task in tasks.values():
+        task()
+    round_seconds = time.perf_counter() - start + PAUSE * len(tasks)
+    estimate.first_call(max(seconds, least * round_seconds), len(tasks))
     times: dict[str, list[float]] = {name: [] for name in tasks}
     shuffle, order = random.Random(0).shuffle, list(tasks.items())
     end = time.perf_counter() + seconds

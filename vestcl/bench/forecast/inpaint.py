@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from vestcl import opencl
+from vestcl.bench.common.estimate import announced
 from vestcl.bench.common.options import JsonOption
 from vestcl.bench.common.results import console as make_console
 from vestcl.bench.common.results import describe, plain, write_json
@@ -97,7 +98,8 @@ def main(config: InpaintBench) -> None:
 
 def _on_streets(config: InpaintBench, console: Console) -> dict[str, Any]:
     scores: dict[str, list[dict[str, float]]] = {method: [] for method in config.methods}
-    for seed in track(range(FIRST_SEED, FIRST_SEED + config.streets), "streets", console=console, transient=True):
+    seeds = announced(range(FIRST_SEED, FIRST_SEED + config.streets), console, "streets")
+    for seed in track(seeds, "streets", config.streets, console=console, transient=True):
         frame = street(seed, config.height, config.width)
         for method in config.methods:
             scores[method].append(score(method, *frame))

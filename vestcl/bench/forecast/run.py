@@ -16,6 +16,7 @@ from typing import Any, Final
 from rich.console import Console
 
 import vestcl
+from vestcl.bench.common.estimate import first_of
 from vestcl.bench.forecast.config import ForecastBench
 from vestcl.bench.forecast.windows import Facts, Group
 from vestcl.cli.progress import progress_bar
@@ -165,8 +166,10 @@ def run(groups: Sequence[Group], config: ForecastBench, networks: Networks, kept
     Raises:
         ValueError: as the readers and forecasts; a window can't be kept.
     """
+    wanted = [(clip.name, index) for group in groups for clip, chosen in group.clips for index in chosen]
+    announce = first_of(sum(kept.get(*window) is None for window in wanted), console, "windows")
     with progress_bar(console, counted=True) as bar:
-        task = bar.add_task("windows", total=sum(len(chosen) for group in groups for _, chosen in group.clips))
+        task = bar.add_task("windows", total=len(wanted))
         for group in groups:
             for clip, chosen in group.clips:
                 bar.update(task, description=clip.name)
@@ -174,6 +177,7 @@ def run(groups: Sequence[Group], config: ForecastBench, networks: Networks, kept
                 bar.advance(task, len(chosen) - len(missing))
                 for index, measured in zip(missing, run_clip(clip, missing, config, networks), strict=True):
                     kept.add(clip.name, index, measured)
+                    announce()
                     bar.advance(task)
                 for window in (kept.get(clip.name, index) for index in chosen):
                     records, facts = window or ([], [])

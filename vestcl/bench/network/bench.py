@@ -13,6 +13,7 @@ from rich.console import Console
 from vestcl import opencl
 from vestcl.bench.common import results as _results
 from vestcl.bench.common import timing as _timing
+from vestcl.bench.common.estimate import announced
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.plots import bars
 from vestcl.bench.common.table import Measurement, Section, verdict
@@ -70,18 +71,21 @@ def main(config: NetworkBench) -> None:
     _results.run("network", config, partial(_sections, config, configuration(config.model)))
 
 
-def _sections(config: NetworkBench, model_config: ModelConfig, _: opencl.Session, __: Console) -> Iterator[Section]:
+def _sections(
+    config: NetworkBench, model_config: ModelConfig, _: opencl.Session, console: Console
+) -> Iterator[Section]:
     """Memory only grows, so the training step comes last."""
     model = made(model_config, config.seed)
     model.options = dataclasses.replace(model.options, seen=False)  # the frames are the same ones in all runs
     window = drive(TRAFFIC, config.height, config.width, LEAST_FRAMES, config.seed).windows[0]
     with _timing.watching_others():
-        runs = [forecast(model.eval(), window) for _run in range(1 + config.runs)]
+        calls = announced(range(1 + config.runs), console, "forecasts")
+        runs = [forecast(model.eval(), window) for _run in calls]
     yield section(config, "forecast", Spread.of_each(runs[1:]))
     if config.training:
         trainer = Trainer(model.train(), (), batch_of(config, config.height, config.width, config.batch))
         with _timing.watching_others():
-            for _run in range(1 + config.runs):
+            for _run in announced(range(1 + config.runs), console, "training steps"):
                 trainer.step()
         seconds = [
             {

@@ -64,7 +64,14 @@ def main(config: ParetoBench) -> None:
         raise ValueError("`seeds` must be one or more streets, got none")
     shipped.find_model(config.model)
     with _timing.recycling_allocator():
-        _results.run("pareto", config, partial(_measure, config))
+        _results.run("pareto", config, partial(_measure, config), partial(_total, config))
+
+
+def _total(config: ParetoBench, seconds: float, tasks: int) -> float:
+    """Of all knobs' settings by that of the first knob's, without combinations, whose number is not known yet."""
+    settings = sum(len(knob.values) for knob in knobs(Forecaster.from_pretrained(config.model)))
+    steps = 2 * sum(HORIZONS) if config.recursion else 0
+    return seconds / tasks * (settings + steps)
 
 
 def _measure(config: ParetoBench, _: opencl.Session, console: Console) -> Iterator[Section]:

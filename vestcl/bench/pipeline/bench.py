@@ -71,7 +71,8 @@ def main(config: PipelineBench) -> None:
         DeviceError: no such device.
     """
     _check(config)
-    _results.run("pipeline", config, partial(_sections, config, load(config)))
+    scenes = len(set(config.scenes))
+    _results.run("pipeline", config, partial(_sections, config, load(config)), lambda seconds, _: seconds * scenes)
 
 
 def load(config: PipelineBench) -> Forecaster:

@@ -61,6 +61,9 @@ class SplatBench(Options):
     """About how long each of the measurements takes."""
     peers: bool = True
     """Also the fastest splatting in torch, and PyTorch3D where it is installed."""
+    reference: bool = True
+    """Also everything that is slow next to vestcl: the peers, and the reference implementation that errors are
+    relative to; --no-reference is --no-peers."""
     compile: bool = True
     """Let torch.compile speed the peer in torch up; it needs a C++ compiler."""
     scaling: bool = False
@@ -79,14 +82,21 @@ def main(config: SplatBench) -> None:
     results.check_positive(config, "height", "width", "seconds", "threads")
     if not config.radii or min(config.radii) <= 0:
         raise ValueError(f"`radii` must be one or more positive numbers, got {config.radii}")
-    results.run("splat", config, partial(_sections, config))
+    results.run("splat", config, partial(_sections, config), lambda seconds, _: seconds * _measurements(config))
+
+
+def _measurements(config: SplatBench) -> int:
+    """How many the bench makes, of about equal time."""
+    peers = len(config.radii) + pytorch3d.is_installed() if config.peers and config.reference else 0
+    sweeps = config.scaling * len(SIZES) + config.channels * len(CHANNEL_SWEEP)
+    return len(config.radii) * (1 + sweeps) + peers
 
 
 def _sections(config: SplatBench, _: opencl.Session, console: Console) -> Iterator[Section]:
     """Everything on one device."""
     size, radii = (config.height, config.width), config.radii
     yield _timed(config, console, "Splat", [(*size, CHANNELS, radius) for radius in radii])
-    if config.peers:
+    if config.peers and config.reference:
         yield from _peers(config, console)
     if config.scaling:
         sizes = [(*size, CHANNELS, radius) for radius in radii for size in SIZES]

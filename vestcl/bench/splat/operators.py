@@ -1,6 +1,6 @@
 """`vestcl bench operators`: each operator next to its reference in torch and a copy of its bytes, both passes."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
@@ -51,8 +51,14 @@ class OperatorsBench(Options):
     """Of the street, opacities and features."""
     seconds: float = 5.0
     """About how long each operator is measured."""
+    reference: bool = True
+    """Also the reference implementation in torch, which is slow, and the error against it."""
     roofline: bool = False
     """Also each splat kernel against the roofs of its device: memory bandwidth and arithmetic."""
+
+
+#: How many operators there are.
+_OPERATORS: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +96,7 @@ def main(config: OperatorsBench) -> None:
         DeviceError: no such device.
     """
     _results.check_positive(config, "height", "width", "channels", "radius", "seconds", "threads")
-    _results.run("operators", config, partial(_sections, config))
+    _results.run("operators", config, partial(_sections, config), lambda seconds, _: seconds * _OPERATORS)
 
 
 def operators(config: OperatorsBench) -> Iterator[Operator]:
@@ -114,7 +120,7 @@ def operators(config: OperatorsBench) -> Iterator[Operator]:
     yield Operator("splat", splat, reference.splat, cloud, (0, 2, 3, 4))
 
 
-def measure(operator: Operator, seconds: float, threads: int) -> list[Measurement]:
+def measure(operator: Operator, seconds: float, threads: int, peer: bool = True) -> list[Measurement]:
     """Time an operator, its reference and copies in turns, then profile its kernels.
 
     Bytes are read and written, every array once. The error is the largest of the results' distances to the reference's,
@@ -124,6 +130,7 @@ def measure(operator: Operator, seconds: float, threads: int) -> list[Measuremen
         operator: with its arguments.
         seconds: about how long the turns take.
         threads: of the copies.
+        peer: whether the reference is timed, and the error measured.
 
     Returns:
         A row for each of `PASSES`.
@@ -134,18 +141,14 @@ def measure(operator: Operator, seconds: float, threads: int) -> list[Measuremen
     moved = _moved_bytes(operator, outputs)
     # Ones, not zeros: memory that was never written is one page of zeros, and reading it costs nothing.
     copies = {what: _timing.memcpy(threads, torch.ones(size // 8)) for what, size in moved.items()}
-    tasks = {
-        f"{what}, {who}": task
-        for who, own in (("vestcl", ours), ("reference", others), ("copy", copies))
-        for what, task in own.items()
-    }
+    timed: dict[str, Mapping[str, Task]] = {"vestcl": ours, **({"reference": others} if peer else {}), "copy": copies}
+    tasks = {f"{what}, {who}": task for who, own in timed.items() for what, task in own.items()}
     staged = {name: partial(_staged, f"{operator.name} {name}", task) for name, task in tasks.items()}
     times = _timing.interleave(staged, seconds)
     rows = list[Measurement]()
     for what in PASSES:
-        own, theirs, copy = (times[f"{what}, {who}"] for who in ("vestcl", "reference", "copy"))
+        own, copy = (times[f"{what}, {who}"] for who in ("vestcl", "copy"))
         name, inside, size = f"{operator.name} {what}", profile(ours[what]), moved[what]
-        error = max(map(_distance, ours[what](), others[what]()))
         rows += [
             Measurement(name, "ms (quartiles)", Spread.of(own), "s", name=name),
             Measurement(name, "MB", size, "B", ".1f"),
@@ -154,10 +157,15 @@ def measure(operator: Operator, seconds: float, threads: int) -> list[Measuremen
             Measurement(name, "x copy", Spread.of(own / copy), digits=".1f", name=name + X_COPY),
             Measurement(name, "kernels ms", Spread.of(inside.kernels), "s", ".2f", f"{name}, kernels"),
             Measurement(name, "around ms", Spread.of(inside.around), "s", ".2f", f"{name}, around kernels"),
-            Measurement(name, "reference ms", Spread.of(theirs), "s", ".2f"),
-            Measurement(name, "x reference", Spread.of(theirs / own), "1", ".1f", f"{name}, twin / vestcl", "higher"),
-            Measurement(name, "error", error, digits=".0e"),
         ]
+        if peer:
+            theirs, error = times[f"{what}, reference"], max(map(_distance, ours[what](), others[what]()))
+            ratio = Spread.of(theirs / own)
+            rows += [
+                Measurement(name, "reference ms", Spread.of(theirs), "s", ".2f"),
+                Measurement(name, "x reference", ratio, "1", ".1f", f"{name}, twin / vestcl", "higher"),
+                Measurement(name, "error", error, digits=".0e"),
+            ]
     return rows
 
 
@@ -193,11 +201,12 @@ def _sections(config: OperatorsBench, _: opencl.Session, console: Console) -> It
     rows = list[Measurement]()
     for operator in operators(config):
         with console.status(operator.name), trace.stage(operator.name):
-            rows += measure(operator, config.seconds, config.threads)
+            rows += measure(operator, config.seconds, config.threads, config.reference)
     size = f"{config.height}x{config.width}, C = {config.channels}, radius {config.radius:g} px, float32"
     notes = ("x copy: over a copy of the same bytes. kernels, around: of profiled calls.",)
+    shown = ("ms (quartiles)", *(["reference ms"] if config.reference else []), "copy ms")
     plots = {
-        "operators": partial(bars, columns=("ms (quartiles)", "reference ms", "copy ms")),
+        "operators": partial(bars, columns=shown),
         "operators, kernels": partial(bars, columns=("kernels ms", "around ms")),
     }
     yield Section(f"Operators, {size}", rows, notes, plots)

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from vestcl import opencl
 from vestcl.bench.common import results as _results
+from vestcl.bench.common.estimate import announced
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.plots import Curve, curves
 from vestcl.bench.common.table import Measurement, Section
@@ -87,7 +88,8 @@ def main(config: StabilityBench) -> int:
     broken = dict[str, list[str]]()
 
     def measure(_: opencl.Session, console: Console) -> Iterator[Section]:
-        for family in [known[name] for name in config.families] or FAMILIES:
+        families = [known[name] for name in config.families] or list(FAMILIES)
+        for family in announced(families, console, "families of inputs"):
             with console.status(family.name):
                 rows = {case: measure_case(case, config.peers) for case in family.cases(config.seed, config.quick)}
             broken.update({case.name: row["broken"] for case, row in rows.items()})
