@@ -5,6 +5,8 @@ From frames to the loss everything is differentiable, the OpenCL splatting inclu
 """
 
 import dataclasses
+import re
+import shlex
 import signal
 import sys
 import time
@@ -195,8 +197,20 @@ class _Run:
                     if self.stop.asked != signal.SIGINT:  # whose line `interrupt.command` prints
                         self.report.say(f"stopped after step {self.step}; --resume continues")
                     return False
-        self.report.say(f"finished: {self.config.out}")
+        for line in self._end():
+            self.report.say(line)
         return True
+
+    def _end(self) -> Iterator[str]:
+        """The lines of a finished run: loss, checkpoint, and what to do with it."""
+        loss = self.report.loss
+        yield f"finished: {self.config.out}, step {self.step}" + ("" if loss is None else f", loss {loss:.4g}")
+        last = next(iter(checkpoint.list_checkpoints(self.config.out)), None)
+        if last is not None:
+            name, path = re.sub(r"[^\w.+-]+", "_", self.config.name) or "mine", shlex.quote(str(last))
+            yield f"checkpoint: {last}"
+            yield f"next: python -m train.evaluate street --model {shlex.quote(f'{name}={last}')}"
+            yield f"      vestcl forecast street:3 --model {path} --compare"
 
     def where(self) -> str:
         """The line of a run that Ctrl-C stopped; the first process prints it for all."""

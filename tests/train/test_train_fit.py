@@ -3,16 +3,19 @@
 import dataclasses
 import errno
 import os
+import shlex
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from train_scenes import MODELS, Processes, configured, steps, street, write_yaml
 
 from train import export, fit
+from train.evaluation.options import Evaluation, models_of
 from train.fit import STOPPED, TrainingError
 from train.run import checkpoint, losses, trainer
 from train.run.checkpoint import CheckpointError
@@ -146,9 +149,21 @@ def test_a_run_learns_in_each_stage_what_that_may(models: None, whole: Path) -> 
             assert objects.changes_nothing == still
 
 
-def test_a_finished_run_is_finished(models: None, cache: Path, whole: Path) -> None:
+def test_a_finished_run_is_finished(models: None, cache: Path, whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It ends with the loss, the checkpoint, and commands that take it."""
     before = checkpoint.load_latest(whole)
     assert run(cache, whole, go_on=True)
+    loss = np.mean([row["loss"] for row in read_log(whole / LOG)])
+    finished, saved, evaluated, forecast = capsys.readouterr().out.splitlines()[-4:]
+    assert finished.startswith(f"finished: {whole}, step 8, loss ")
+    assert float(finished.split()[-1]) == pytest.approx(loss, rel=1e-3)
+    last = checkpoint.list_checkpoints(whole)[0]
+    assert saved == f"checkpoint: {last}"
+    command = shlex.split(evaluated.removeprefix("next: "))
+    assert command[:4] == ["python", "-m", "train.evaluate", "street"]
+    (path,) = models_of(Evaluation("street", model=(Path(command[-1]),))).values()
+    assert path == last / "ema.safetensors"
+    assert forecast.split()[:2] == ["vestcl", "forecast"] and str(last) in forecast
     after = checkpoint.load_latest(whole)
     assert before is not None and after is not None
     assert_same(after.model, before.model, "model")

@@ -77,7 +77,7 @@ class Reporter:
         if self._recent and self._recent[-1].keys() != logged.keys():  # a stage with other terms
             self._recent.clear()
         self._recent.append(logged)
-        self._bar.update(self._task, completed=step, description=self._described(stage))
+        self._bar.update(self._task, completed=step, description=f"{stage}  loss {self.loss or 0:.4f}")
         run = self._config.run
         with self._even_on_a_full_disk():
             if step % run.log_every == 0 or step == self._config.steps:
@@ -86,6 +86,11 @@ class Reporter:
                 self._show(step, update.view, batch)
         if update.skipped:
             self.say(f"step {step}: non-finite, skipped ({', '.join(batch.clips)})", "yellow")
+
+    @property
+    def loss(self) -> float | None:
+        """Mean over the last updates; None before the first."""
+        return _means_of(list(self._recent)[-_SMOOTHED:])["loss"] if self._recent else None
 
     @property
     def recent(self) -> list[dict[str, float]]:
