@@ -120,7 +120,7 @@ def _planned(options: commands.Forecast, setup: _Setup, console: Console) -> lis
     for text in texts:
         size, frames = (options.height, options.width), options.frames or STREET_FRAMES
         clip = open_clip(text, options, size, frames, setup.estimators)
-        steps = horizon.steps_of(options, clip.interval, text)
+        steps = horizon.steps_of(options, clip.interval, clip.name)
         views = parse_views(options.view or ("source",), clip[0])
         checks.check_memory(steps, clip, len(views))
         one = planned(clip, text, len(drives) + 1, steps, options.every, options.frame)

@@ -92,7 +92,7 @@ def run(options: commands.Forecast) -> None:
             inpaint = None if options.inpaint is None else inpainter(options.inpaint, "inpaint")
             size = options.height, options.width
             clip = open_clip(text, options, size, horizon.street_frames(options, text), estimators)
-            steps = horizon.steps_of(options, clip.interval, text)
+            steps = horizon.steps_of(options, clip.interval, clip.name)
             chosen = options.mode, options.perceive, *estimators, inpaint
             later = None if model is None else later_frames(model.config, *chosen)
             index = horizon.current_frame(clip, options, steps)
