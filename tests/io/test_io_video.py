@@ -307,3 +307,22 @@ def test_real_motorway() -> None:
     opened = io.Video(real("highway.mp4"))
     assert (len(opened), opened.height, opened.width, opened.fps) == (221, 540, 960, 25)
     assert opened[30].std() > 20
+
+
+def test_more_frames_are_kept_if_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Back and forth over 20 frames, without going to a key frame again."""
+    video = io.Video(write_video(tmp_path / "long.mp4", flat(24), gop=24))
+    restarts: list[int] = []
+    restart = _video_decoder.Decoder._restart
+    monkeypatch.setattr(
+        _video_decoder.Decoder, "_restart", lambda self, key: (restarts.append(key), restart(self, key))
+    )
+    order = [0, 20, 1, 21, 2, 22, 3]
+    assert [index_of(video[index]) for index in order] == order
+    assert restarts
+    video.keep(24)
+    restarts.clear()
+    assert [index_of(video[index]) for index in (0, *order)] == [0, *order]
+    assert len(restarts) <= 1
+    video.keep(2)
+    assert index_of(video[1]) == 1 and len(restarts) <= 1, "fewer are not asked for"

@@ -23,7 +23,7 @@ from vestcl.evaluation.compare import FORECAST, METRICS
 from vestcl.evaluation.drive import files
 from vestcl.evaluation.drive.files import DriveFolder
 from vestcl.evaluation.drive.frame import DriveFrames, ForecastFrame, score_rows
-from vestcl.evaluation.drive.plan import Drive
+from vestcl.evaluation.drive.plan import Drive, keep_decoded
 from vestcl.evaluation.drive.plan import drive as planned
 from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.scores import GEOMETRIC
@@ -189,7 +189,8 @@ def _forecast_drive(
         return
     trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
     st_lpips = None if options.st_lpips is None else StLpips.load(options.st_lpips)
-    perception = Perception(drive.clip, inpaint=setup.inpaint)
+    keep_decoded(drive)
+    perception = Perception(drive.clip, inpaint=setup.inpaint, work_width=options.work_width or None)
     frames = DriveFrames(
         drive.clip,
         perception,

@@ -18,6 +18,7 @@ from vestcl.cli import checks, commands, horizon
 from vestcl.cli.clip import load_estimators, open_clip
 from vestcl.cli.progress import ProgressBar, progress_bar
 from vestcl.clock import Clock
+from vestcl.constants import WORK_WIDTH
 from vestcl.data.sample import Clip
 from vestcl.evaluation import compare
 from vestcl.evaluation.compare import Comparison
@@ -140,7 +141,7 @@ def _forecast(
     """By the network, or without one the geometric forecast."""
     stages.show("forecast", 0.0)
     asked = clip, index, steps, views
-    how: dict[str, Any] = {"work_width": options.work_width or None}
+    how: dict[str, Any] = {} if options.work_width == WORK_WIDTH else {"work_width": options.work_width or None}
     how |= {} if inpaint is None else {"inpaint": inpaint}
     if model is None or later is None:
         from vestcl.forecasting import geometric

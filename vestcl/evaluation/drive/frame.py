@@ -18,7 +18,7 @@ from vestcl.scene.perception import Perception
 ForecastFrame = Callable[[Perception, int, int, Sequence[View]], Forecast]
 """Called with the perception of a clip, the index of t, the steps and the views."""
 
-#: Frames before t whose images are kept: what a forecast may ask for again.
+#: Frames before t whose true images are kept: baselines need them.
 _BEFORE: Final = 2
 
 #: Widest image of the video's cells, px: four of them are within what browsers' decoders take.
@@ -72,8 +72,6 @@ class DriveFrames:
             ValueError: a file missing or damaged, or a clip without a source of depth.
         """
         self._truth.forget(index - _BEFORE)
-        for at in (index - 1, index):  # read as the truth of an earlier frame
-            self.perception.once("read", at, lambda at=at: self._truth.full(_SOURCE, at))  # type: ignore[misc]
         forecasts = {name: make(self.perception, index, steps, views) for name, make in self.methods.items()}
         forecast = forecasts[FORECAST]
         known = [view for view in views if seen_by(view, self.clip[index]) is not None]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from vestcl.data.sample import Clip
+from vestcl.data.sources import VideoFrame
 from vestcl.forecasting.files import CONTEXT, FPS
 
 #: Frames per second that a video has at least, by repeated frames: players are slow to start and to seek below.
@@ -15,6 +16,12 @@ _SLOWEST: Final = 5.0
 
 #: Seconds that a frame before a gap in time is shown for, where its own share of the drive is not longer.
 _LONGEST: Final = 2.0
+
+#: Frames before t that a forecast reads.
+_READ_BEFORE: Final = 8
+
+#: Decoded frames that are kept at most: 3 MB each at 1080 x 1920.
+_MOST_DECODED: Final = 100
 
 #: Letters of a clip's name in its folder's.
 _NAME_LENGTH: Final = 60
@@ -71,6 +78,17 @@ def drive(clip: Clip, text: str, number: int, steps: int, every: int, first: int
     name = re.sub(r"[^\w.-]+", "_", clip.name).strip("._")[:_NAME_LENGTH] or "clip"
     indices = tuple(index for index in whole if index in wanted)
     return Drive(clip, text, f"{number:03}_{name}", indices, steps, every)
+
+
+def keep_decoded(drive: Drive) -> None:
+    """Let a video keep the frames from the first that a forecast reads to its last true one: no frame is decoded twice.
+
+    Args:
+        drive: of a clip of any kind.
+    """
+    source = drive.clip[0].image
+    if isinstance(source, VideoFrame):
+        source.video.keep(min(_READ_BEFORE + drive.steps + drive.every, _MOST_DECODED))
 
 
 def video_rate(drives: Sequence[Drive]) -> float:

@@ -23,6 +23,8 @@ class Decoder:
     stream: VideoStream
     first: VideoFrame
     """The first frame that can be decoded."""
+    keeps: int
+    """Decoded frames that are kept."""
 
     def __init__(self, path: Path, frames: Frames) -> None:
         """Open ``path`` at its beginning.
@@ -30,7 +32,7 @@ class Decoder:
         Raises:
             ValueError: it can't be opened, or no frame of it can be decoded.
         """
-        self._path, self._frames = path, frames
+        self._path, self._frames, self.keeps = path, frames, KEPT
         self._open()
         first = next(self._decoded, None)
         if first is None:
@@ -83,7 +85,7 @@ class Decoder:
 
     def _is_ahead(self, index: int) -> bool:
         """Whether continuing to decode reaches frame ``index`` sooner than going to a key frame."""
-        return self._last < index and (index - self._last <= KEPT or self._number(self._key(index)) <= self._last)
+        return self._last < index and (index - self._last <= self.keeps or self._number(self._key(index)) <= self._last)
 
     def _number(self, key: int) -> int:
         """Number of the key frame in the list; 0 for the first."""
@@ -106,9 +108,9 @@ class Decoder:
     def _decode_to(self, index: int) -> bool:
         """Decode on to frame ``index``; False if a later one comes, or the end."""
         for number, frame in self._numbered():
-            if number > index - KEPT:
+            if number > index - self.keeps:
                 self._kept[number] = frame
-            for old in [kept for kept in self._kept if kept <= number - KEPT]:
+            for old in [kept for kept in self._kept if kept <= number - self.keeps]:
                 del self._kept[old]
             if number >= index:
                 return number == index

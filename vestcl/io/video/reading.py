@@ -9,7 +9,7 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.io.video.decoder import Decoder
+from vestcl.io.video.decoder import KEPT, Decoder
 from vestcl.io.video.packets import list_frames, orientation, oriented
 from vestcl.times import median_interval
 
@@ -52,8 +52,14 @@ class Video:
         self.frames, self.seconds = len(self._list.pts), self._list.seconds
         rate = decoder.stream.average_rate or 1
         interval = median_interval(self.seconds)
+        self._keeps = KEPT
         self.fps = float(rate) if interval is None else round(1 / interval, 6)
         self._open()
+
+    def keep(self, frames: int) -> None:
+        """Keep at least this many decoded frames: reading may go back that far without decoding again."""
+        self._keeps = max(self._keeps, frames)
+        self._decoder.keeps = self._keeps
 
     def __len__(self) -> int:
         return self.frames
@@ -92,6 +98,7 @@ class Video:
         if "_decoder" in vars(self):
             _ABANDONED.append(self._decoder)
         self._decoder: Decoder = Decoder(self.path, self._list)
+        self._decoder.keeps = self._keeps
         self._lock, self._pid = threading.Lock(), os.getpid()
 
     def _orient(self, decoder: Decoder) -> None:
