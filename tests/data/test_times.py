@@ -151,3 +151,27 @@ def test_a_blank_line_does_not_shift_poses(tmp_path: Path) -> None:
     poses.write_text("\n".join([lines[0], "", *lines[1:]]) + "\n")
     with pytest.raises(ValueError, match=r"03\.txt: line 2 is blank; it must have what belongs to frame 1"):
         opened(path)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "interval", "steps"),
+    [(0.5, 0.1, 5), (0.5, 1 / 30, 15), (0.5, 1 / 17, 9), (0.25, 0.1, 3), (0.35, 0.1, 4), (0.05, 0.1, 1), (2.0, 1.0, 2)],
+)
+def test_steps_of_a_time_ahead(seconds: float, interval: float, steps: int) -> None:
+    """To the nearest; a half upwards."""
+    assert times.steps_ahead(seconds, interval, "clip") == steps
+
+
+@pytest.mark.parametrize(
+    ("seconds", "interval", "message"),
+    [
+        (0.04, 0.1, r"clip: has a frame every 0\.1 s; `seconds` must be half of it or more, got 0\.04"),
+        (0.0, 0.1, "`seconds` must be positive, got 0"),
+        (-1.0, 0.1, "`seconds` must be positive"),
+        (float("nan"), 0.1, "`seconds` must be positive"),
+        (0.5, None, "clip: has no times, so that `seconds` can't be counted in frames; give `steps`"),
+    ],
+)
+def test_a_time_ahead_that_is_no_steps(seconds: float, interval: float | None, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        times.steps_ahead(seconds, interval, "clip")

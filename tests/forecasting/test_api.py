@@ -1,5 +1,6 @@
 """vestcl.open and vestcl.forecast: clips, futures as arrays and files, networks by name, folder and repository."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -216,6 +217,17 @@ def test_pushed(model: vestcl.Forecaster, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(hub_mixin, "HfApi", Api)
     assert model.push_to_hub("someone/net") == "commit"
     assert uploaded == {"someone/net": {"README.md", "config.json", "model.safetensors"}}
+
+
+def test_seconds_in_place_of_steps() -> None:
+    """At 10 Hz 0.24 s are two steps; both, or the seconds of a clip without times, are refused."""
+    clip = vestcl.open("street:3", height=48, width=96, frames=4)
+    assert vestcl.forecast(clip, seconds=0.24).steps == 2
+    with pytest.raises(ValueError, match="`steps` and `seconds` both say how far"):
+        vestcl.forecast(clip, steps=2, seconds=0.2)
+    bare = dataclasses.replace(clip, samples=tuple(dataclasses.replace(sample, timestamp=None) for sample in clip))
+    with pytest.raises(ValueError, match="has no times"):
+        vestcl.forecast(bare, seconds=0.2)
 
 
 # ---------------------------------------------------------------- the package
