@@ -1,10 +1,15 @@
 """Progress bars on the terminal."""
 
 import time
+from typing import Final
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.table import Column
 from rich.text import Text
+
+#: As wide as a stage's name gets: step, clock and time left have space in 80 columns.
+_LABEL: Final = 30
 
 
 class ProgressBar(Progress):
@@ -40,7 +45,11 @@ def progress_bar(console: Console, *, counted: bool = False, hidden: bool = Fals
         hidden: shows nothing.
         stays: whether the bar is still there when it has ended.
     """
-    columns: list[ProgressColumn] = [TextColumn("{task.description}"), BarColumn(bar_width=None)]
+    label = Column(max_width=_LABEL, no_wrap=True, overflow="ellipsis")
+    columns: list[ProgressColumn] = [
+        TextColumn("{task.description}", table_column=label),
+        BarColumn(bar_width=None),
+    ]
     columns += [MofNCompleteColumn()] if counted else []
     columns += [RunningClock(), TimeRemainingColumn()]
     hidden = hidden or not console.is_terminal

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 from vestcl.data import calibration, fit
 from vestcl.data.calibration import Matrix
 from vestcl.data.lens import Distortion
-from vestcl.data.readers.posed import Posed, check_options, posed_clip, rotation_of
+from vestcl.data.readers.posed import Posed, check_options, is_file, posed_clip, rotation_of
 from vestcl.data.sample import Clip
 from vestcl.io.atomic import read_bytes
 
@@ -164,7 +164,7 @@ def _image_folder(model: Path, name: str) -> Path:
     """The folder that the model's first image is in."""
     above = [model, *model.absolute().parents[:2]]
     folders = [folder / images for folder in above for images in _FOLDERS]
-    found = next((folder for folder in folders if (folder / name).is_file()), None)
+    found = next((folder for folder in folders if is_file(folder / name)), None)
     if found is None:
         looked = ", ".join(str(folder) for folder in folders)
         raise ValueError(f"{model / IMAGES}: there is no image {name}; it looked in {looked}")

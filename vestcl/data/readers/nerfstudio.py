@@ -20,7 +20,7 @@ from vestcl.data import calibration, fit
 from vestcl.data.calibration import Matrix
 from vestcl.data.lens import Distortion
 from vestcl.data.readers.files import IMAGE_SUFFIXES
-from vestcl.data.readers.posed import Posed, check_options, posed_clip
+from vestcl.data.readers.posed import Posed, check_options, is_file, posed_clip
 from vestcl.data.sample import Clip
 from vestcl.io.images import image_size
 from vestcl.io.strict_json import read_object
@@ -44,6 +44,10 @@ _COEFFICIENTS: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 #: OpenGL's camera axes to OpenCV's: y and z change their sign.
 _GL_FROM_CV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+
+#: The largest number of a file, and the smallest scale: with them all products are finite, and matrices have inverses.
+_MOST: Final = 1e12
+_LEAST_SCALE: Final = 1e-9
 
 #: Bytes of the largest file that is read.
 _LARGEST: Final = 1 << 28
@@ -103,11 +107,11 @@ def _image(folder: Path, name: Any, where: str) -> Path:
         raise ValueError(f"{where}: `file_path` must be the path of an image, got {_text(name)}")
     path = folder / name
     if path.suffix.lower() in IMAGE_SUFFIXES:
-        if not path.is_file():
+        if not is_file(path):
             raise ValueError(f"{where}: there is no image {path}")
         return path
     suffixes = [variant for suffix in IMAGE_SUFFIXES for variant in (suffix, suffix.upper())]
-    found = next((other for suffix in suffixes if (other := Path(f"{path}{suffix}")).is_file()), None)
+    found = next((other for suffix in suffixes if is_file(other := Path(f"{path}{suffix}"))), None)
     if found is None:
         raise ValueError(f"{where}: there is no image {path} with one of the suffixes {', '.join(IMAGE_SUFFIXES)}")
     return found
@@ -172,8 +176,8 @@ def _original_from_world(file: Path, content: Mapping[str, Any]) -> Matrix:
         if not np.linalg.det(applied[:3, :3]) > 1e-12:
             raise ValueError(f"{where} must be a rotation and a shift, got {applied[:3].tolist()}")
     scale = _number(content, "applied_scale", str(file))
-    if scale is not None and not scale > 0:
-        raise ValueError(f"{file}: `applied_scale` must be positive, got {scale:g}")
+    if scale is not None and not scale >= _LEAST_SCALE:
+        raise ValueError(f"{file}: `applied_scale` must be {_LEAST_SCALE:g} or more, got {scale:g}")
     applied[:3] *= 1.0 if scale is None else scale
     return np.asarray(np.linalg.inv(applied), np.float64)
 
@@ -198,7 +202,7 @@ def _matrix(value: Any, shapes: tuple[tuple[int, int], ...], where: str) -> Matr
     shape = len(rows), len(rows[0]) if rows else 0
     numbers = [entry for row in rows for entry in row]
     is_matrix = shape in shapes and all(len(row) == shape[1] for row in rows) and all(map(_is_number, numbers))
-    if not is_matrix or not np.isfinite(np.array(rows, np.float64)).all():
+    if not is_matrix:
         wanted = " or ".join(f"[{height}, {width}]" for height, width in shapes)
         raise ValueError(f"{where} must be {wanted} finite numbers, got {_text(value)}")
     matrix = np.eye(4)
@@ -213,13 +217,13 @@ def _number(entries: Mapping[str, Any], key: str, where: str) -> float | None:
     value = entries.get(key)
     if value is None:
         return None
-    if not _is_number(value) or not math.isfinite(value):
-        raise ValueError(f"{where}: `{key}` must be a finite number, got {_text(value)}")
+    if not _is_number(value):
+        raise ValueError(f"{where}: `{key}` must be a finite number, at most {_MOST:g}, got {_text(value)}")
     return float(value)
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MOST
 
 
 def _text(value: Any) -> str:

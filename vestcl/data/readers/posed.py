@@ -32,6 +32,14 @@ class Posed(NamedTuple):
     """[4, 4], camera axes x right, y down, z forward, in the list's unit."""
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is a file; not for a name that no file can have."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def check_options(fps: float | None, scale: float) -> None:
     """Refuse what is no rate and no unit.
 
@@ -60,7 +68,7 @@ def posed_clip(name: str, kind: str, images: Sequence[Posed], fps: float | None,
     ordered = sorted(images, key=lambda image: natural(str(image.path)))
     _check_names(ordered)
     for image in ordered:
-        if not image.path.is_file():
+        if not is_file(image.path):
             raise ValueError(f"{image.where}: there is no image {image.path}")
     size = image_size(ordered[0].path)
     _check_sizes(ordered)
@@ -121,7 +129,7 @@ def rotation_of(quaternion: Sequence[float], where: str) -> Matrix:
         ValueError: no direction: 0, or not finite.
     """
     q = np.array(quaternion, np.float64)
-    length = float(np.linalg.norm(q))
+    length = math.hypot(*quaternion)
     if not (math.isfinite(length) and length > 1e-8):
         raise ValueError(f"{where}: a quaternion must be finite and not 0, got {list(quaternion)}")
     w, x, y, z = q / length
