@@ -129,7 +129,7 @@ def test_streets_by_seed_and_seconds(tmp_path: Path, repeater: Repeater, capsys:
 def test_baselines_with_compare(tmp_path: Path, repeater: Repeater) -> None:
     arguments = ["forecast", str(write_clip(tmp_path / "clip")), "--every", "9", "--steps", "1", "--compare"]
     assert cli.main([*arguments, "--out", str(tmp_path / "out")]) == 0
-    assert [row["method"] for row in scores(tmp_path / "out")] == ["repeat last", "optical flow", "forecast"]
+    assert [row["method"] for row in scores(tmp_path / "out")] == ["forecast", "repeat last", "optical flow"]
 
 
 @pytest.mark.parametrize(

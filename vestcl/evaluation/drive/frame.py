@@ -95,7 +95,9 @@ class DriveFrames:
         }
         if self.baselines:
             made = predictions(self._truth, index, len(later), known, timed)
-        return score(self._truth, index, known, made, forecasts[FORECAST], later=later)
+        records = score(self._truth, index, known, made, forecasts[FORECAST], later=later)
+        names = [view.name for view in known]
+        return sorted(records, key=lambda record: (names.index(record.view), record.method != FORECAST))
 
     def _title(self, index: int, forecast: Forecast, steps: int) -> str:
         sample, ahead = self.clip[index], steps * (self.clip.interval or 0.0)
