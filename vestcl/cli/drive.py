@@ -5,7 +5,7 @@ import statistics
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final
 
 from rich import box
 from rich.console import Console
@@ -15,8 +15,9 @@ from rich.text import Text
 from vestcl import interrupt, opencl
 from vestcl._version import __version__
 from vestcl.cli import checks, commands, horizon
-from vestcl.cli.clip import load_estimators, open_clip
+from vestcl.cli.clip import open_clip
 from vestcl.cli.progress import progress_bar
+from vestcl.cli.setup import Setup, load
 from vestcl.data.open import clips_in
 from vestcl.data.street import input as street_input
 from vestcl.evaluation.compare import FORECAST, METRICS
@@ -25,20 +26,13 @@ from vestcl.evaluation.drive.files import DriveFolder
 from vestcl.evaluation.drive.frame import DriveFrames, ForecastFrame, score_rows
 from vestcl.evaluation.drive.plan import Drive, keep_decoded
 from vestcl.evaluation.drive.plan import drive as planned
-from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.scores import GEOMETRIC
-from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.forecasting.geometric.forecast import forecast_frames as forecast_geometric
 from vestcl.forecasting.geometric.memory import MEMORY
-from vestcl.forecasting.network.later_frames import LaterFrames, later_frames
 from vestcl.forecasting.views import parse_views
 from vestcl.models import shipped
 from vestcl.models.inference import quality
-from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
 from vestcl.scene.perception import Perception
-
-if TYPE_CHECKING:
-    from vestcl.models.forecaster import Forecaster
 
 #: Frames of a street if no number is given.
 STREET_FRAMES: Final = 30
@@ -48,15 +42,6 @@ _FREE: Final = ("out", "threads", "device", "exr", "gif", "input", "steps", "sec
 
 #: Steps in the table of scores, so that it fits 80 columns; scores.csv has all.
 _SHOWN: Final = 4
-
-
-class _Setup(NamedTuple):
-    """What is loaded once for all clips."""
-
-    model: "Forecaster | None"
-    later: LaterFrames | None
-    inpaint: Inpainter | None
-    estimators: Any
 
 
 def run(options: commands.Forecast) -> None:
@@ -72,7 +57,7 @@ def run(options: commands.Forecast) -> None:
     with opencl.use(options.device):
         with progress_bar(console) as bar:
             bar.add_task("open the clips", total=None)
-            setup = _load(options)
+            setup = load(options)
             drives = _planned(options, setup, console)
             folder = DriveFolder(options.out, _request(options, drives))
         for each in drives:
@@ -83,16 +68,6 @@ def run(options: commands.Forecast) -> None:
             bar.add_task("write the video", total=None)
             folder.finish(drives, _about(drives, made, seconds))
     _print_end(console, folder, drives, made, seconds)
-
-
-def _load(options: commands.Forecast) -> _Setup:
-    level = options.quality or quality.USUAL
-    model = None if options.model is None else quality.load(options.model, level)
-    estimators = load_estimators(options.depth_model, options.mask_model)
-    inpaint = None if options.inpaint is None else inpainter(options.inpaint, "inpaint")
-    chosen = options.mode, options.perceive, *estimators, inpaint
-    later = None if model is None else later_frames(model.config, *chosen)
-    return _Setup(model, later, inpaint, estimators)
 
 
 def _inputs(options: commands.Forecast) -> Iterator[str]:
@@ -106,7 +81,7 @@ def _inputs(options: commands.Forecast) -> Iterator[str]:
             yield from map(str, clips_in(text))
 
 
-def _planned(options: commands.Forecast, setup: _Setup, console: Console) -> list[Drive]:
+def _planned(options: commands.Forecast, setup: Setup, console: Console) -> list[Drive]:
     """The clips that have a frame to forecast; the others are reported.
 
     Raises:
@@ -159,7 +134,7 @@ def _identity(drive: Drive) -> str:
 
 
 def _forecast_all(
-    options: commands.Forecast, drives: list[Drive], setup: _Setup, folder: DriveFolder, console: Console
+    options: commands.Forecast, drives: list[Drive], setup: Setup, folder: DriveFolder, console: Console
 ) -> tuple[int, float]:
     """Forecast the frames that are not there yet; how many, and in how many seconds."""
     missing = [[index for index in each.indices if not folder.has(each, index)] for each in drives]
@@ -182,13 +157,11 @@ def _forecast_all(
 
 
 def _forecast_drive(
-    options: commands.Forecast, drive: Drive, indices: list[int], setup: _Setup, folder: DriveFolder
+    options: commands.Forecast, drive: Drive, indices: list[int], setup: Setup, folder: DriveFolder
 ) -> Iterator[int]:
     """Forecast frames of one clip in rising order, and keep each; yields it then."""
     if not indices:
         return
-    trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
-    st_lpips = None if options.st_lpips is None else StLpips.load(options.st_lpips)
     keep_decoded(drive)
     perception = Perception(drive.clip, inpaint=setup.inpaint, work_width=options.work_width or None)
     frames = DriveFrames(
@@ -196,8 +169,8 @@ def _forecast_drive(
         perception,
         _methods(options, setup),
         baselines=options.compare,
-        trunk=trunk,
-        st_lpips=st_lpips,
+        trunk=setup.trunk,
+        st_lpips=setup.st_lpips,
         size=options.score_size,
     )
     begin = drive.clip[0].timestamp
@@ -210,7 +183,7 @@ def _forecast_drive(
         yield index
 
 
-def _methods(options: commands.Forecast, setup: _Setup) -> Mapping[str, ForecastFrame]:
+def _methods(options: commands.Forecast, setup: Setup) -> Mapping[str, ForecastFrame]:
     """The forecast, and with ``compare`` next to a network's the geometric one."""
     memory = MEMORY if options.memory is None else options.memory
 

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from rich import box
 from rich.console import Console
@@ -15,27 +15,22 @@ from rich.text import Text
 
 from vestcl import opencl
 from vestcl.cli import checks, commands, horizon
-from vestcl.cli.clip import load_estimators, open_clip
+from vestcl.cli.clip import open_clip
 from vestcl.cli.progress import ProgressBar, progress_bar
+from vestcl.cli.setup import Setup, load
 from vestcl.clock import Clock
 from vestcl.constants import WORK_WIDTH
 from vestcl.data.sample import Clip
 from vestcl.evaluation import compare
 from vestcl.evaluation.compare import Comparison
-from vestcl.evaluation.perceptual import StLpips
-from vestcl.evaluation.trunks.trunks import load_trunk
 from vestcl.forecasting import files as forecast_files
 from vestcl.forecasting import page
-from vestcl.forecasting.network.later_frames import LaterFrames, later_frames
+from vestcl.forecasting.network.later_frames import LaterFrames
 from vestcl.forecasting.result import Forecast, SkippedWork, View
 from vestcl.forecasting.sheets import forecast_sheet
 from vestcl.forecasting.views import parse_views
 from vestcl.models import shipped
 from vestcl.models.inference import quality
-from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
-
-if TYPE_CHECKING:
-    from vestcl.models.forecaster import Forecaster
 
 #: Steps in a table of scores, so that it fits 80 letters; forecast.json has all.
 STEPS_SHOWN: Final = 5
@@ -69,50 +64,48 @@ class _Stages:
 
 
 def run(options: commands.Forecast) -> None:
-    """Do what the options ask for.
+    """Do what the options ask for: a single forecast, or those of whole drives.
 
     Raises:
         ValueError: an option out of range, or a file that is missing or malformed; the message names it.
         DeviceError: no such OpenCL device.
     """
     checks.check_forecast(options)
-    if options.every is not None:
-        from vestcl.cli import drive
-
-        drive.run(options)
+    if options.every is None:
+        _run_single(options)
         return
+    from vestcl.cli import drive
+
+    drive.run(options)
+
+
+def _run_single(options: commands.Forecast) -> None:
     (text,) = options.input
     console = Console()
     bar = progress_bar(console)
     with opencl.use(options.device), bar:
         stages = _Stages(bar)
         with stages.stage("open the clip"):
-            level = options.quality or quality.USUAL
-            model = None if options.model is None else quality.load(options.model, level)
-            estimators = load_estimators(options.depth_model, options.mask_model)
-            inpaint = None if options.inpaint is None else inpainter(options.inpaint, "inpaint")
-            size = options.height, options.width
-            clip = open_clip(text, options, size, horizon.street_frames(options, text), estimators)
+            setup, size = load(options), (options.height, options.width)
+            clip = open_clip(text, options, size, horizon.street_frames(options, text), setup.estimators)
             steps = horizon.steps_of(options, clip.interval, clip.name)
-            chosen = options.mode, options.perceive, *estimators, inpaint
-            later = None if model is None else later_frames(model.config, *chosen)
             index = horizon.current_frame(clip, options, steps)
             views = parse_views(options.view or ("source",), clip[index])
             checks.check_memory(steps, clip, len(views))
-            trunk = None if options.squeeze is None else load_trunk("squeezenet1_0", options.squeeze)
-            st_lpips = None if options.st_lpips is None else StLpips.load(options.st_lpips)
-        forecast = _forecast(clip, index, steps, options, views, stages, inpaint, model, later)
+        forecast = _forecast(clip, index, steps, options, views, stages, setup)
         stages.clock.seconds |= forecast.seconds
         comparisons, rival = list[Comparison](), None
         if options.compare:
             with stages.stage("compare") as report:
-                comparisons = compare.compare(forecast, clip, index, views, trunk, report, st_lpips, options.score_size)
-                if model is not None:
-                    rival = _forecast(clip, index, steps, options, views, stages, inpaint)
-                    rivals = compare.compare(rival, clip, index, views, trunk, None, st_lpips, options.score_size)
+                scored = clip, index, views, setup.trunk
+                how = setup.st_lpips, options.score_size
+                comparisons = compare.compare(forecast, *scored, report, *how)
+                if setup.model is not None:
+                    rival = _forecast(clip, index, steps, options, views, stages, setup.by_geometry)
+                    rivals = compare.compare(rival, *scored, None, *how)
                     comparisons = [_with_rival(*pair, rival.method) for pair in zip(comparisons, rivals, strict=True)]
         with stages.stage(forecast_files.WRITING) as report:
-            details = _details(options, clip, index, forecast, comparisons, later)
+            details = _details(options, clip, index, forecast, comparisons, setup.later)
             timed = dataclasses.replace(forecast, seconds=dict(stages.clock.seconds))
             write = functools.partial(forecast_files.write_forecast, exr=options.exr, gif=options.gif, report=report)
             write(options.out, timed, clip, index, views, details)
@@ -121,7 +114,7 @@ def run(options: commands.Forecast) -> None:
     if line := horizon.horizon_line(options, clip, steps):
         console.print(Text(line), soft_wrap=True)
     for comparison in comparisons:
-        console.print(_score_table(comparison, later))
+        console.print(_score_table(comparison, setup.later))
         if rival is not None and (line := where_another_is_better(comparison, forecast.method, rival.method)):
             console.print(Text(line), soft_wrap=True)
     _print_end(console, forecast_files.read_forecast(options.out))
@@ -134,15 +127,14 @@ def _forecast(
     options: commands.Forecast,
     views: list[View],
     stages: _Stages,
-    inpaint: Inpainter | None = None,
-    model: "Forecaster | None" = None,
-    later: LaterFrames | None = None,
+    setup: Setup,
 ) -> Forecast:
     """By the network, or without one the geometric forecast."""
     stages.show("forecast", 0.0)
     asked = clip, index, steps, views
     how: dict[str, Any] = {} if options.work_width == WORK_WIDTH else {"work_width": options.work_width or None}
-    how |= {} if inpaint is None else {"inpaint": inpaint}
+    how |= {} if setup.inpaint is None else {"inpaint": setup.inpaint}
+    model, later = setup.model, setup.later
     if model is None or later is None:
         from vestcl.forecasting import geometric
 
