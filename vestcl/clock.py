@@ -1,11 +1,14 @@
 """The one clock of stages: seconds by name, for tables; for torch's profiler and for `vestcl.opencl.trace` as well."""
 
 import contextlib
+import logging
 import time
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
+
+_LOG: Final = logging.getLogger(__name__)
 
 Seen = Callable[[str, Any], None]
 """Called with a stage's name and result."""
@@ -65,6 +68,7 @@ class Clock:
             wall, cpu = time.perf_counter() - start, time.process_time() - cpu_start
             inner, cpu_inner = self._inner if self.exclusive else (0.0, 0.0)
             self.add(name, wall - inner, cpu - cpu_inner)
+            _LOG.debug("%s: %.3f s", name, wall - inner)
             self._inner = around[0] + wall, around[1] + cpu
 
     def add(self, name: str, seconds: float, cpu_seconds: float) -> None:

@@ -5,6 +5,7 @@ import errno
 import logging
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final, TextIO, TypeVar
@@ -99,6 +100,47 @@ def run(parse: Callable[[], Parsed], own: bool) -> int:
                 raise
             print_error(f"error: {options.as_typed(in_words(error), config)}")
             return REFUSED
+
+
+@contextlib.contextmanager
+def loudness(quiet: bool, verbose: bool) -> Iterator[None]:
+    """What a command prints inside the ``with`` block.
+
+    Args:
+        quiet: only what goes to stderr.
+        verbose: what vestcl logs, too, to stderr, each stage with its seconds, and the traceback of an error.
+
+    Raises:
+        ValueError: both.
+    """
+    if quiet and verbose:
+        raise ValueError("`quiet` and `verbose` exclude each other")
+    with contextlib.ExitStack() as stack:
+        if quiet:
+            stack.enter_context(contextlib.redirect_stdout(stack.enter_context(open(os.devnull, "w"))))  # noqa: PTH123
+        if verbose:
+            stack.enter_context(_log_to_stderr())
+        try:
+            yield
+        except Exception:
+            if verbose:
+                traceback.print_exc()
+            raise
+
+
+@contextlib.contextmanager
+def _log_to_stderr() -> Iterator[None]:
+    """What vestcl logs below warnings, which have lines of their own."""
+    logger, handler = logging.getLogger("vestcl"), logging.StreamHandler()
+    handler.addFilter(lambda record: record.levelno < logging.WARNING)
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 def is_known(error: Exception) -> bool:

@@ -19,6 +19,10 @@ class CommonOptions:
 
     threads: int | None = None
     """CPU threads of torch, OpenCV and PoCL. Default: as many as there are cores."""
+    quiet: bool = False
+    """Print warnings and errors only."""
+    verbose: bool = False
+    """Print each stage and its seconds to stderr, too, and the traceback of an error."""
 
 
 @dataclass(frozen=True)

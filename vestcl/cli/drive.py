@@ -38,7 +38,20 @@ from vestcl.scene.perception import Perception
 STREET_FRAMES: Final = 30
 
 #: Options that the results do not depend on.
-_FREE: Final = ("out", "threads", "device", "exr", "gif", "input", "steps", "seconds", "model", "quality")
+_FREE: Final = (
+    "out",
+    "threads",
+    "quiet",
+    "verbose",
+    "device",
+    "exr",
+    "gif",
+    "input",
+    "steps",
+    "seconds",
+    "model",
+    "quality",
+)
 
 #: Steps in the table of scores, so that it fits 80 columns; scores.csv has all.
 _SHOWN: Final = 4

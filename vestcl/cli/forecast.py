@@ -195,7 +195,7 @@ def _details(
         for name in forecast.frames[0]
     }
     scores = {name: comparison.scores for name, comparison in compared.items()} if options.compare else None
-    unused = ("every", "frames")  # of whole drives
+    unused = ("every", "frames", "quiet", "verbose")  # of whole drives, and of the terminal
     settings = {name: value for name, value in dataclasses.asdict(options).items() if name not in unused}
     settings |= {"input": options.input[0], "steps": len(forecast.frames)}
     if options.model is not None and later is not None:

@@ -94,11 +94,12 @@ def _parsed_command(arguments: Sequence[str]) -> tuple[Any, Callable[[], int]]:
 
 
 def _run(command: Any) -> int:
-    from vestcl.cli import threads
+    from vestcl.cli import command_line, threads
 
     threads.apply(getattr(command, "threads", None))
     start, busy = time.perf_counter(), time.process_time()
-    status = _run_here(command)
+    with command_line.loudness(command.quiet, command.verbose):
+        status = _run_here(command)
     if type(command).__name__ == "View":  # which waits for its visitors
         return status
     if line := threads.slow_line(time.perf_counter() - start, time.process_time() - busy):
