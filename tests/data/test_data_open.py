@@ -10,11 +10,11 @@ import test_data_folder
 import test_data_kitti_odometry
 import test_data_kitti_raw
 import test_data_virtual_kitti
-from data_files import noise_image, real, write_text
+from data_files import noise_image, real, write_images, write_text
 from video_files import write_video
 
 from vestcl import io
-from vestcl.data.open import open_sequence
+from vestcl.data.open import clips_in, open_sequence
 from vestcl.data.readers.video import open_video
 
 
@@ -132,3 +132,21 @@ def test_real_data() -> None:
         assert (clip.kind, len(clip)) == (kind, frames)
         image = clip[frames - 1].read_image() if kind != "video" else clip[3].read_image()
         assert image.shape == (3, 256, 832) and 0 <= image.min() < image.max() <= 1
+
+
+def test_clips_in_a_folder(tmp_path: Path) -> None:
+    """In natural order; what is no clip, or hidden, is left out; a preview next to videos is no clip."""
+    for name in ("b10.mp4", "b9.MP4", ".hidden.mp4", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    write_images(tmp_path / "a", ["0.png"])
+    (tmp_path / "empty").mkdir()
+    wanted = [tmp_path / name for name in ("a", "b9.MP4", "b10.mp4")]
+    assert clips_in(tmp_path) == wanted
+    write_images(tmp_path, ["preview.jpg"])
+    assert clips_in(tmp_path) == wanted
+    write_text(tmp_path / "camera.json", "{}")
+    assert clips_in(tmp_path) == [tmp_path]
+    assert clips_in(tmp_path / "a") == [tmp_path / "a"]
+    assert clips_in(tmp_path / "empty") == [tmp_path / "empty"]
+    assert clips_in(tmp_path / "b10.mp4") == [tmp_path / "b10.mp4"]
+    assert clips_in(tmp_path / "none") == [tmp_path / "none"]

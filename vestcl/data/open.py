@@ -141,13 +141,16 @@ def clips_in(path: str | Path) -> list[Path]:
         ValueError: a folder that can't be read.
     """
     path = Path(path)
-    if _layout_of(path) is not None or not path.is_dir():
+    if not path.is_dir():
         return [path]
     try:
         inside = sorted(path.iterdir(), key=lambda file: natural(file.name))
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}") from error
-    return [each for each in inside if not each.name.startswith(".") and _layout_of(each) is not None] or [path]
+    clips = [each for each in inside if not each.name.startswith(".") and _layout_of(each) is not None]
+    layout, has_video = _layout_of(path), any(each.suffix.lower() in VIDEO_SUFFIXES for each in clips)
+    is_clip = layout is not None and not (layout.opens is folder.open_folder and has_video)  # a preview next to videos
+    return [path] if is_clip or is_present(path / "camera.json") else clips or [path]
 
 
 def _layout_of(path: Path) -> _Layout | None:
