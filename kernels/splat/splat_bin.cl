@@ -40,6 +40,7 @@ kernel void scan_chunks(
     global int* restrict tile_counts)  // [B, tiles] out
 {
   const int t = get_global_id(0), b = get_global_id(1);
+  if (t >= tiles) return;
   int sum = 0;
   for (int c = 0; c < chunks; c++) {
     global int* at = counts + ((size_t)b * chunks + c) * tiles + t;
@@ -125,8 +126,10 @@ kernel void sort_tiles_together(
       const int start = i / (2 * run) * (2 * run);
       const int middle = smaller_of(start + run, n), stop = smaller_of(start + 2 * run, n);
       const key_bits key = a[i].key;
-      const int before = i < middle ? i + rank_in(a + middle, stop - middle, key, false)
-                                    : i - run + rank_in(a + start, run, key, true);
+      const bool in_order = middle == stop || a[middle - 1].key <= a[middle].key;
+      const int before = in_order     ? i
+                         : i < middle ? i + rank_in(a + middle, stop - middle, key, false)
+                                      : i - run + rank_in(a + start, run, key, true);
       b[before] = a[i];
     }
     barrier(CLK_GLOBAL_MEM_FENCE);

@@ -2,7 +2,7 @@
 // splat_composite.cl.
 //
 // Forward: the group stages GROUP points of the tile's list at a time in local memory, and each work-item composites
-// those that reach its pixel. Backward, three steps, none of which adds to what another work-item writes:
+// those that reach its pixel. It goes on to the next points only if a pixel of the tile can still change. Backward, three steps, none of which adds to what another work-item writes:
 //   1. each pixel traverses its fragments forward and backward and writes w_i and dL/da_i to scratch at (entry, pixel),
 //   2. each entry sums over its pixels; entries of a point in several tiles run in several launches, as in
 //      splat_composite.cl, so that only one at a time adds to the point's gradients,
@@ -65,16 +65,18 @@ kernel void composite_pixels(
     global REAL* restrict coverage)           // [B, H, W] out
 {
   local record_t staged[GROUP];
+  local int last_open;  // the last e after whose points a pixel of the tile could still change
   const int lane = get_local_id(0), index = get_group_id(0), first = get_global_id(1) * CHANNEL_GROUP;
   const int channels = smaller_of(CHANNEL_GROUP, CHANNELS - first);
   const int b = index / (tiles_y * tiles_x);
   const int x = index % tiles_x * TILE + lane % TILE, y = index / tiles_x % tiles_y * TILE + lane / TILE;
+  const bool shown = x < width && y < height;
   REAL sums[CHANNEL_GROUP];
   for (int c = 0; c < CHANNEL_GROUP; c++) sums[c] = 0;
   REAL t = 1;
   const int begin = tile_starts[index], end = tile_starts[index + 1];
+  if (lane == 0) last_open = -1;
   for (int e = begin; e < end; e += GROUP) {
-    barrier(CLK_LOCAL_MEM_FENCE);
     stage(staged, lane, e, end, records, finite);
     barrier(CLK_LOCAL_MEM_FENCE);
     const int count = smaller_of(GROUP, end - e);
@@ -87,8 +89,11 @@ kernel void composite_pixels(
       for (int c = 0; c < channels; c++) sums[c] += w * row[c];
       t *= 1 - a;
     }
+    if (shown && EXISTS(0, 1, t) && t != 0) last_open = e;  // the same number from all who write it
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (last_open != e) break;  // all work-items read the same: barriers do not diverge
   }
-  if (x < width && y < height) {
+  if (shown) {
     const size_t at = ((size_t)b * height + y) * width + x;
     if (first == 0) coverage[at] = 1 - t;
     for (int c = 0; c < channels; c++)
@@ -220,12 +225,14 @@ kernel void sum_scratch(
 // Step 3, one work-item per channel of a tile.
 kernel void sum_tile_backgrounds(
     const int height, const int width, const int tiles_y, const int tiles_x,
+    const int tiles,  // of all images
     const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
     global const REAL* restrict transmittance,    // [B, H, W]
     global const REAL* restrict grad_image,       // [B, C, H, W] by strides
     global REAL* restrict tile_grad_backgrounds)  // [B * tiles, C] out
 {
-  const int c = get_global_id(0), index = get_global_id(1);
+  const int i = get_global_id(0), index = i / CHANNELS, c = i % CHANNELS;
+  if (index >= tiles) return;
   const int b = index / (tiles_y * tiles_x);
   const int left = index % tiles_x * TILE, top = index / tiles_x % tiles_y * TILE;
   global const REAL* g = grad_image + b * image_stride + c * channel_stride;
@@ -236,6 +243,6 @@ kernel void sum_tile_backgrounds(
       row += transmittance[((size_t)b * height + y) * width + x] * g[y * row_stride + x * pixel_stride];
     sum += row;
   }
-  tile_grad_backgrounds[(size_t)index * CHANNELS + c] = sum;
+  tile_grad_backgrounds[i] = sum;
 }
 #endif

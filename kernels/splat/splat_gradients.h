@@ -65,11 +65,12 @@ inline REAL sum_over_tiles(int b, int c, int tiles, global const REAL* tile_grad
 
 // One work-item per channel of an image.
 kernel void sum_grad_backgrounds(
-    const int tiles,
+    const int batch, const int tiles,
     global const REAL* restrict tile_grad_backgrounds,  // [B, tiles, C]
     global REAL* restrict grad_backgrounds)             // [B, C] out
 {
-  const int c = get_global_id(0), b = get_global_id(1);
-  grad_backgrounds[b * CHANNELS + c] = sum_over_tiles(b, c, tiles, tile_grad_backgrounds);
+  const int i = get_global_id(0), b = i / CHANNELS, c = i % CHANNELS;
+  if (b >= batch) return;
+  grad_backgrounds[i] = sum_over_tiles(b, c, tiles, tile_grad_backgrounds);
 }
 #endif

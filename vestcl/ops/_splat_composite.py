@@ -120,8 +120,9 @@ def composite_forward(layer: Layer) -> tuple[Array, Array, Array]:
         defines = layer.defines()
         saved_buffer = job.write(saved) if geometry.points else job.scratch(1, np.int32)
         if geometry.points:
-            count = np.int32(geometry.points)
-            job.launch(_PIXELS, "find_finite", defines, (geometry.points,), [count, features, saved_buffer])
+            items, group = opencl.grouped(lists.session, geometry.points)
+            arguments: list[opencl.Argument] = [np.int32(geometry.points), features, saved_buffer]
+            job.launch(_PIXELS, "find_finite", defines, (items,), arguments, (group,))
         job.launch(
             _PIXELS, "composite_pixels", defines, (tiles * _GROUP, -(-layer.channels // layer.channel_group)),
             [*layer.scalars(), *lists_read, saved_buffer, features, backgrounds, *shown],
@@ -168,12 +169,13 @@ def composite_backward(
             return grads
         if geometry.points:
             clear: list[opencl.Argument] = [np.int32(geometry.points), layer.lists.intersections, *outputs]
-            chunks = chunks_of(layer.lists.session, geometry.points, 1)
-            job.launch(file, "clear_gradients", defines, (chunks,), clear)
+            chunks, group = chunks_of(layer.lists.session, geometry.points, 1)
+            job.launch(file, "clear_gradients", defines, (chunks,), clear, (group,))
         launch(job, layer, defines, saved, grad_image, grad_coverage, outputs, per_tile)
         if needs_grad.backgrounds:
-            total: list[opencl.Argument] = [np.int32(geometry.tiles), per_tile, backgrounds]
-            job.launch(file, "sum_grad_backgrounds", defines, (layer.channels, geometry.batch), total)
+            total: list[opencl.Argument] = [np.int32(geometry.batch), np.int32(geometry.tiles), per_tile, backgrounds]
+            items, group = opencl.grouped(layer.lists.session, geometry.batch * layer.channels)
+            job.launch(file, "sum_grad_backgrounds", defines, (items,), total, (group,))
     return grads
 
 
@@ -253,9 +255,10 @@ def _launch_pixels_backward(
             (_GROUP, 1, 1),
         )  # fmt: skip
     if defines["GRAD_BACKGROUNDS"]:
+        items, group = opencl.grouped(lists.session, tiles * layer.channels)
         job.launch(
-            _PIXELS, "sum_tile_backgrounds", defines, (layer.channels, tiles),
-            [*geometry.sizes, *strides, transmittance, grad, per_tile],
+            _PIXELS, "sum_tile_backgrounds", defines, (items,),
+            [*geometry.sizes, np.int32(tiles), *strides, transmittance, grad, per_tile], (group,),
         )  # fmt: skip
 
 

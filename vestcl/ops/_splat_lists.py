@@ -88,10 +88,16 @@ class TileLists:
         return _steps(self.extent, self.grid)
 
 
-def chunks_of(session: opencl.Session, points: int, counters: int) -> int:
-    """Work-items that share ``points``, with ``counters`` numbers each. No result depends on it."""
-    chunks = CHUNKS_PER_UNIT * session.info.compute_units if session.mapping == "tile" else points // GPU_CHUNK
-    return max(1, min(chunks, MAX_COUNTERS // counters))
+def chunks_of(session: opencl.Session, points: int, counters: int) -> tuple[int, int]:
+    """Work-items that share ``points``, with ``counters`` numbers each, and how many of them are a work-group.
+
+    No result depends on it.
+    """
+    most = max(1, MAX_COUNTERS // counters)
+    if session.mapping == "tile":
+        return min(CHUNKS_PER_UNIT * session.info.compute_units, most), 1
+    group = min(opencl.GPU_GROUP, most)
+    return min(-(-points // (GPU_CHUNK * group)), most // group) * group, group
 
 
 def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
@@ -104,7 +110,8 @@ def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
         intersections = job.scratch(geometry.points, np.int32)
         if geometry.points == 0:
             return _sort(job, geometry, _starts(tile_counts), np.ones((), np.int32), intersections, None)
-        chunks = chunks_of(session, geometry.points // geometry.batch, geometry.tiles * geometry.batch)
+        mean_points = -(-geometry.points // geometry.batch)
+        chunks, group = chunks_of(session, mean_points, geometry.tiles * geometry.batch)
         extents = np.ones((geometry.batch, chunks), np.int32)
         starts, points_uv, z, radii, opacities = (
             job.read(array)
@@ -116,10 +123,13 @@ def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
             "splat/splat_bin.cl", "count_tiles", defines, (chunks, geometry.batch),
             [*geometry.sizes, starts, points_uv, z, radii, opacities, transparent, intersections, counts,
              job.write(extents)],
+            (group, 1),
         )  # fmt: skip
+        items, together = opencl.grouped(session, geometry.tiles)
         job.launch(
-            "splat/splat_bin.cl", "scan_chunks", defines, (geometry.tiles, geometry.batch),
+            "splat/splat_bin.cl", "scan_chunks", defines, (items, geometry.batch),
             [np.int32(chunks), np.int32(geometry.tiles), counts, job.write(tile_counts)],
+            (together, 1),
         )  # fmt: skip
         job.sync()
         tile_starts = _starts(tile_counts)
@@ -127,6 +137,7 @@ def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
         job.launch(
             "splat/splat_bin.cl", "fill_tiles", defines, (chunks, geometry.batch),
             [*geometry.sizes, starts, points_uv, z, radii, intersections, job.read(tile_starts), counts, entries],
+            (group, 1),
         )  # fmt: skip
         return _sort(job, geometry, tile_starts, extents.max(), intersections, entries)
 

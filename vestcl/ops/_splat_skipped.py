@@ -47,13 +47,15 @@ def count_culled(geometry: Geometry, lists: TileLists) -> dict[str, int]:
     """Points that are in no list, by `REASONS`."""
     if geometry.points == 0:
         return dict.fromkeys(REASONS, 0)
-    counts = np.zeros((chunks_of(lists.session, geometry.points, len(REASONS)), len(REASONS)), np.int32)
+    chunks, group = chunks_of(lists.session, geometry.points, len(REASONS))
+    counts = np.zeros((chunks, len(REASONS)), np.int32)
     sizes = [np.int32(n) for n in (geometry.height, geometry.width, geometry.points)]
     arrays = (geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
     defines = opencl.defines_for(geometry.z.dtype)
     with lists.session.job() as job:
         job.launch(
-            "splat/splat_skipped.cl", "count_skipped", defines, (len(counts),),
+            "splat/splat_skipped.cl", "count_skipped", defines, (chunks,),
             [*sizes, *map(job.read, arrays), lists.intersections, job.write(counts)],
+            (group,),
         )  # fmt: skip
     return {reason: int(count) for reason, count in zip(REASONS, counts.sum(axis=0), strict=True)}

@@ -135,11 +135,13 @@ def _backward_motion(
     if points_xyz.size:
         defines = _defines(points_xyz.dtype)
         with session.job() as job:
+            items, group = opencl.grouped(session, CHUNKS)
             partial_sums = job.scratch(batch * CHUNKS * 3 * 4, points_xyz.dtype)
             inputs = [job.read(points_xyz), job.read(grad_displacement_xyz)]
             arguments: list[opencl.Argument] = [np.int32(count), *inputs, partial_sums]
-            job.launch("rigid_flow.cl", "rigid_flow_backward_sums", defines, (CHUNKS, batch), arguments)
+            job.launch("rigid_flow.cl", "rigid_flow_backward_sums", defines, (items, batch), arguments, (group, 1))
             outputs = [job.write(grad_quaternion), job.write(grad_translation)]
-            arguments = [job.read(quaternion), partial_sums, *outputs]
-            job.launch("rigid_flow.cl", "rigid_flow_backward_motion", defines, (batch,), arguments)
+            arguments = [np.int32(batch), job.read(quaternion), partial_sums, *outputs]
+            items, group = opencl.grouped(session, batch)
+            job.launch("rigid_flow.cl", "rigid_flow_backward_motion", defines, (items,), arguments, (group,))
     return grad_quaternion, grad_translation

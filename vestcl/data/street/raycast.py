@@ -3,6 +3,7 @@
 A pixel's ray is s (R K^-1) (u, v, 1), scaled so that s is its z-depth; see kernels/raycast/raycast.cl.
 """
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -194,18 +195,20 @@ def cast(
         shadow_rects = job.scratch(4 * count, np.float32)
         tiles = [image_rects, *_lists(job, tile_rows * tile_columns, count)]
         shadows, cell_lists = [shadow_cells, shadow_rects], _lists(job, cells * cells, count)
-        sizes = _int32(height, width, cells, cells)
+        sizes = _int32(height, width, cells, cells, count)
         bent = scene.course is not None
         _launch(job, "project_solids", (count,), [*sizes, view, solids, image_rects, *shadows], bent=bent)
-        _launch(job, "list_solids", (tile_rows,), [*_int32(tile_columns, tile, count), *tiles], bent=bent)
-        _launch(job, "list_solids", (cells,), [*_int32(cells, 1, count), shadow_cells, *cell_lists], bent=bent)
-        sizes = _int32(height, width, tile_columns, count, len(scene.crossings), cells, cells)
+        sizes = _int32(tile_rows, tile_columns, tile, count)
+        _launch(job, "list_solids", (tile_rows,), [*sizes, *tiles], bent=bent)
+        sizes = _int32(cells, cells, 1, count)
+        _launch(job, "list_solids", (cells,), [*sizes, shadow_cells, *cell_lists], bent=bent)
+        sizes = _int32(height, width, tile_rows, tile_columns, count, len(scene.crossings), cells, cells)
         wanted = _int32(samples, frame.instances is not None)
         scenery = [view, solids, *tiles, shadow_rects, *cell_lists, side_streets]
         arguments = [*sizes, *wanted, *scenery, *_outputs(job, frame, index)]
         if scene.course is not None:
             arguments += [*_int32(len(scene.course)), job.read(scene.course)]
-        _launch(job, "raycast", (tile_rows * tile_columns, tile), arguments, (1, tile), bent=bent)
+        _launch(job, "raycast", (tile_rows * tile_columns, tile), arguments, bent=bent)
 
 
 def _outputs(job: opencl.Job, frame: Frame, index: int) -> list[opencl.Argument]:
@@ -218,10 +221,10 @@ def _launch(
     name: str,
     global_size: tuple[int, ...],
     arguments: list[opencl.Argument],
-    local_size: tuple[int, ...] | None = None,
     *,
     bent: bool,
 ) -> None:
+    """A kernel for the first dimension's items; a second dimension is a tile's rows, which share a group."""
     names = {f"{kind.__name__.upper()}_{m.name}": int(m) for kind in (Shape, Material, Label) for m in kind}
     defines = opencl.defines_for(
         np.dtype(np.float32), SKY_DEPTH=f"{STREET_SKY_DEPTH}f", SHADOW_CELL=f"{SHADOW_CELL}f", **names
@@ -234,7 +237,9 @@ def _launch(
             "NEWTON": _NEWTON,
             "SMOOTH": _SMOOTH,
         }
-    job.launch("raycast/raycast.cl", name, defines, global_size, arguments, local_size)
+    first, *rows = global_size
+    items, group = opencl.grouped(job.session, first, at_once=math.prod(rows))
+    job.launch("raycast/raycast.cl", name, defines, (items, *rows), arguments, (group, *rows))
 
 
 def _int32(*values: int) -> list[np.int32]:
