@@ -104,7 +104,7 @@ inline int rank_in(global const entry_t* a, int n, key_bits key, bool equal_too)
 }
 
 // The same lists by one work-group per tile, for GPUs: merge sort, where each entry finds its rank in the other half.
-kernel void sort_tiles_together(
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void sort_tiles_together(
     const int height, const int width, const int tiles_y, const int tiles_x,
     const int step_y, const int step_x,                // of the backward, see first_box
     global const int* restrict tile_starts,            // [B * tiles + 1]

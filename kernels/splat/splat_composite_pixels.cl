@@ -21,6 +21,9 @@
 #ifndef TRUNCATE
 #error "define TRUNCATE as 0 or 1"
 #endif
+#if CHANNEL_GROUP < 1
+#error "CHANNEL_GROUP must be at least 1"
+#endif
 
 inline void clear_row(global REAL* row) {
   for (int c = 0; c < CHANNELS; c++) row[c] = 0;
@@ -54,7 +57,7 @@ inline void stage(
   }
 }
 
-kernel void composite_pixels(
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void composite_pixels(
     const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
     global const int* restrict tile_starts,   // [B * tiles + 1]
     global const record_t* restrict records,  // [E]
@@ -105,7 +108,7 @@ kernel void composite_pixels(
 inline int offset_in(box_t box, int x, int y) { return (y - box.y0) * (box.x1 - box.x0) + x - box.x0; }
 
 // Step 1.
-kernel void composite_pixels_backward(
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void composite_pixels_backward(
     const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
     const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
     global const int* restrict tile_starts,     // [B * tiles + 1]
@@ -166,7 +169,7 @@ kernel void composite_pixels_backward(
 }
 
 // Step 2, for the tiles (x0 + i * step_x, y0 + j * step_y): no two of them share a point.
-kernel void sum_scratch(
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void sum_scratch(
     const int height, const int width, const int tiles_y, const int tiles_x,
     const int x0, const int y0, const int step_x, const int step_y,
     const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,

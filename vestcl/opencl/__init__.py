@@ -9,11 +9,12 @@ if TYPE_CHECKING:  # all load on first use: what needs no device is to start at 
     from vestcl.opencl.groups import GPU_GROUP, grouped
     from vestcl.opencl.programs import Defines, defines_for, kernel_folder, source
     from vestcl.opencl.selection import current, free_scratch, open_session, use
-    from vestcl.opencl.session import Argument, Buffer, Job, JobTimes, KernelTime, Launch, Session, observe
+    from vestcl.opencl.session import Argument, Arguments, Buffer, Job, JobTimes, KernelTime, Launch, Session, observe
 
 __all__ = [
     "GPU_GROUP",
     "Argument",
+    "Arguments",
     "Buffer",
     "Defines",
     "DeviceError",
@@ -42,7 +43,9 @@ _FILES = {
     "DeviceError": "errors",
     **dict.fromkeys(("GPU_GROUP", "grouped"), "groups"),
     **dict.fromkeys(("Defines", "defines_for", "kernel_folder", "source"), "programs"),
-    **dict.fromkeys(("Argument", "Buffer", "Job", "JobTimes", "KernelTime", "Launch", "Session", "observe"), "session"),
+    **dict.fromkeys(
+        ("Argument", "Arguments", "Buffer", "Job", "JobTimes", "KernelTime", "Launch", "Session", "observe"), "session"
+    ),
 }
 
 

@@ -5,7 +5,8 @@ makes the results visible::
 
     session = opencl.current()
     with session.job() as job:
-        job.launch("unproject.cl", "unproject", {"REAL": "float"}, (count,), [np.int32(count), job.read(depth), ...])
+        arguments = {"count": np.int32(count), "depth": job.read(depth), ...}
+        job.launch("unproject.cl", "unproject", {"REAL": "float"}, (count,), arguments)
 
 An exception may come up between any two bytecodes (KeyboardInterrupt does). What an interrupted job leaves behind, the
 next one clears away: it waits for kernels that still run, and only then lets go of their arrays.
@@ -16,7 +17,7 @@ import functools
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -28,11 +29,13 @@ from vestcl.opencl import forks, pocl_cache, pocl_cpu
 from vestcl.opencl.device_list import DeviceInfo
 from vestcl.opencl.errors import DeviceError
 from vestcl.opencl.forks import refuse_after_fork, was_forked
+from vestcl.opencl.parameters import check_arguments, parameters
 from vestcl.opencl.programs import Defines, source
 from vestcl.opencl.robust_lock import Holder, RobustLock, WithBlock
 
 Buffer = cl.MemoryObjectHolder
 Argument = Buffer | np.generic
+Arguments = Mapping[str, Argument]
 
 _POCL: Final = "Portable Computing Language"
 
@@ -141,8 +144,8 @@ class Session:
         self._device = device
         self._plain_queue = self._queue = cl.CommandQueue(self._context)
         self._kernels: dict[tuple[str, tuple[tuple[str, str | int], ...]], dict[str, cl.Kernel]] = {}
-        self._typed_kernels: dict[tuple[Any, ...], cl.Kernel] = {}
-        """By file, name and defines in the order they came in."""
+        self._typed_kernels: dict[tuple[Any, ...], tuple[cl.Kernel, tuple[str, ...]]] = {}
+        """By file, name and defines in the order they came in; each with the names of its parameters."""
         #: Results are in the arrays of `Job.write` as soon as a kernel is done; else only after `Job.sync`.
         self.writes_host_memory = self.shares_host_memory and info.platform == _POCL and self._fills_host_memory()
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self._queue))
@@ -184,8 +187,10 @@ class Session:
             self._kernels[key] = {kernel.function_name: kernel for kernel in program.all_kernels()}
         return self._kernels[key][name]
 
-    def _typed_kernel(self, file: str, name: str, defines: Defines, arguments: Sequence[Argument]) -> cl.Kernel:
-        """`kernel`, its scalars of the types that these have, which every launch gives it.
+    def _typed_kernel(
+        self, file: str, name: str, defines: Defines, arguments: Arguments
+    ) -> tuple[cl.Kernel, tuple[str, ...]]:
+        """`kernel`, and the names of its parameters; its first launch shows that ``arguments`` fit them.
 
         Without types pyopencl tries to read each scalar as a buffer first: 9 us each, 2 us for all of them with types.
         """
@@ -193,8 +198,10 @@ class Session:
         key = (file, name, *defines.items())
         if key not in self._typed_kernels:
             kernel = self.kernel(file, name, defines)
-            kernel.set_scalar_arg_dtypes([type(a) if isinstance(a, np.generic) else None for a in arguments])
-            self._typed_kernels[key] = kernel
+            wanted = parameters(source(file), name, defines)
+            check_arguments(f"kernel {name} of {file}", wanted, arguments)
+            kernel.set_scalar_arg_dtypes([parameter.scalar for parameter in wanted])
+            self._typed_kernels[key] = kernel, tuple(parameter.name for parameter in wanted)
         return self._typed_kernels[key]
 
     def _fills_host_memory(self) -> bool:
@@ -393,13 +400,17 @@ class Job(Holder):
         name: str,
         defines: Defines,
         global_size: Sequence[int],
-        arguments: Sequence[Argument],
+        arguments: Arguments,
         local_size: Sequence[int] | None = None,
     ) -> None:
-        """Enqueue kernel ``name``; scalars come as NumPy scalars of the exact C type."""
+        """Enqueue kernel ``name``; arguments go by its parameters' names, scalars as NumPy scalars of the exact C type.
+
+        Raises:
+            TypeError: at the kernel's first launch, arguments that do not fit it.
+        """
         session = self.session
-        kernel = session._typed_kernel(file, name, defines, arguments)
-        values: Sequence[Any] = arguments  # pyopencl's type for them leaves out its own pooled buffers
+        kernel, names = session._typed_kernel(file, name, defines, arguments)
+        values: list[Any] = [arguments[name] for name in names]  # pyopencl's type leaves out its own pooled buffers
         kernel.set_args(*values)
         local = tuple(local_size) if local_size else (1,) * len(global_size)
         profiles = tuple(session._profiles)
