@@ -9,7 +9,9 @@
 //   3. each tile sums its pixels' share of the background's gradient.
 //
 //   CHANNELS         features per point
-//   CHANNEL_GROUP    channels that one work-item of the forward keeps in registers
+//   CHANNEL_GROUP    channels that one work-item of the forward keeps in registers: at most CHANNELS. Where it does not
+//                    divide CHANNELS, the last group overlaps the one before, so that every loop has that many turns:
+//                    an array that is indexed in any other loop would be in memory.
 #include "common.h"
 #include "splat.h"
 #ifndef CHANNELS
@@ -21,8 +23,8 @@
 #ifndef TRUNCATE
 #error "define TRUNCATE as 0 or 1"
 #endif
-#if CHANNEL_GROUP < 1
-#error "CHANNEL_GROUP must be at least 1"
+#if CHANNEL_GROUP < 1 || CHANNEL_GROUP > CHANNELS
+#error "CHANNEL_GROUP must be at least 1 and at most CHANNELS"
 #endif
 
 inline void clear_row(global REAL* row) {
@@ -69,12 +71,13 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void composite_pixels(
 {
   local record_t staged[GROUP];
   local int last_open;  // the last e after whose points a pixel of the tile could still change
-  const int lane = get_local_id(0), index = get_group_id(0), first = get_global_id(1) * CHANNEL_GROUP;
-  const int channels = smaller_of(CHANNEL_GROUP, CHANNELS - first);
+  const int lane = get_local_id(0), index = get_group_id(0), own = get_global_id(1) * CHANNEL_GROUP;
+  const int first = smaller_of(own, CHANNELS - CHANNEL_GROUP);  // channels before `own` are another group's
   const int b = index / (tiles_y * tiles_x);
   const int x = index % tiles_x * TILE + lane % TILE, y = index / tiles_x % tiles_y * TILE + lane / TILE;
   const bool shown = x < width && y < height;
   REAL sums[CHANNEL_GROUP];
+#pragma unroll
   for (int c = 0; c < CHANNEL_GROUP; c++) sums[c] = 0;
   REAL t = 1;
   const int begin = tile_starts[index], end = tile_starts[index + 1];
@@ -89,7 +92,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void composite_pixels(
       if (!EXISTS(d2, r2, t) || t == 0) continue;
       const REAL a = staged[i].o - staged[i].o / r2 * d2, w = a * t;
       global const REAL* row = features + (size_t)staged[i].id * CHANNELS + first;
-      for (int c = 0; c < channels; c++) sums[c] += w * row[c];
+#pragma unroll
+      for (int c = 0; c < CHANNEL_GROUP; c++) sums[c] += w * row[c];
       t *= 1 - a;
     }
     if (shown && EXISTS(0, 1, t) && t != 0) last_open = e;  // the same number from all who write it
@@ -98,9 +102,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void composite_pixels(
   }
   if (shown) {
     const size_t at = ((size_t)b * height + y) * width + x;
-    if (first == 0) coverage[at] = 1 - t;
-    for (int c = 0; c < channels; c++)
-      image[at * CHANNELS + first + c] = sums[c] + t * backgrounds[b * CHANNELS + first + c];
+    if (own == 0) coverage[at] = 1 - t;
+#pragma unroll
+    for (int c = 0; c < CHANNEL_GROUP; c++)
+      if (first + c >= own) image[at * CHANNELS + first + c] = sums[c] + t * backgrounds[b * CHANNELS + first + c];
   }
 }
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 from test_splat import Scene, all_of, assert_same_bits, detached, scene
+from tolerances import assert_like_reference
 
-from vestcl import opencl
+from vestcl import opencl, reference
 from vestcl.data import Street, intrinsics
 from vestcl.opencl import session as session_module
 from vestcl.ops.displace import displace
@@ -169,3 +170,18 @@ def test_opaque_layers_take_a_fraction_of_the_time(
     late = never_leaving()
     monkeypatch.setattr(opencl, "current", lambda: late)
     assert early < composite_seconds(late, arguments) / 3
+
+
+# ---------------------------------------------------------------- channels in groups
+
+
+@pytest.mark.parametrize("channels", [31, 32, 33, 70])
+def test_channels_in_overlapping_groups(pixels: opencl.Session, channels: int) -> None:
+    """Of 33 the second group composites 31 that the first has written, and writes one."""
+    arguments = scene(2, 60, channels)
+    assert_like_reference(splat, reference.splat, **arguments)
+    image, _ = splat(**detached(arguments))
+    for c in (0, channels - 32, 31, channels - 1):
+        c = max(0, min(c, channels - 1))
+        only = {name: arguments[name].detach()[..., c : c + 1] for name in ("features", "backgrounds")}
+        torch.testing.assert_close(image[:, c], splat(**detached(arguments) | only)[0][:, 0], rtol=1e-5, atol=1e-6)
