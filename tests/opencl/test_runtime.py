@@ -219,12 +219,18 @@ def test_results_of_one_launch_feed_the_next(kernels: Path, fresh: opencl.Sessio
         assert result.tolist() == [1, 4, 7, 10, 13]
 
 
-def test_a_cpu_reads_the_array_itself(kernels: Path, fresh: opencl.Session) -> None:
+@pytest.mark.parametrize("offset", [4, 64, 128, 4096])
+def test_a_cpu_reads_the_array_itself(kernels: Path, fresh: opencl.Session, offset: int) -> None:
+    """However it is aligned; even if nobody may write it."""
     if fresh.info.kind != "CPU":
         pytest.skip("this device has its own memory")
-    array, result = np.ones(8, np.float32), np.empty(8, np.float32)
+    memory, result = np.ones(3 * 4096, np.uint8), np.empty(8, np.float32)
+    start = -memory.ctypes.data % 4096 + offset
+    array = memory[start : start + 32].view(np.float32)
+    protected = array.view()
+    protected.flags.writeable = False
     with fresh.job() as job:
-        arguments = {"factor": np.float32(2), "in": job.read(array), "out": job.write(result)}
+        arguments = {"factor": np.float32(2), "in": job.read(protected), "out": job.write(result)}
         array[:] = 21  # after `read`: a copy would not see it
         job.launch("scale.cl", "scale", opencl.defines_for(array.dtype), array.shape, arguments)
     assert result.tolist() == [42] * 8

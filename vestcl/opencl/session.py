@@ -373,8 +373,10 @@ class Job(Holder):
     def read(self, array: np.ndarray) -> Buffer:
         """``array`` as kernel input; on a CPU device the kernel reads the array itself."""
         assert array.flags.forc and array.size > 0
-        where = cl.mem_flags.USE_HOST_PTR if self.session.shares_host_memory else cl.mem_flags.COPY_HOST_PTR
-        buffer = cl.Buffer(self.session._context, cl.mem_flags.READ_ONLY | where, hostbuf=array)
+        # Not READ_ONLY: Intel's runtime copies such an array where it is not aligned to 128 bytes, and back at every map.
+        shared, copied = cl.mem_flags.USE_HOST_PTR, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
+        flags = shared if self.session.shares_host_memory else copied
+        buffer = cl.Buffer(self.session._context, flags, hostbuf=array)
         self.session._bound.append((buffer, array))
         return buffer
 
