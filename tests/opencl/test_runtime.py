@@ -207,6 +207,28 @@ def test_scalars_change_from_launch_to_launch(kernels: Path, fresh: opencl.Sessi
     assert scale(fresh, 0.1, array.astype(np.float64))[0] == 0.1
 
 
+LOG = """Compilation started
+Options used by backend compiler: -cl-std=CL1.2 -Werror -Wno-warning
+remark: <unknown>:0:0: loop not vectorized: Control flow cannot be substituted for a select
+Kernel "scale" was not vectorized
+Done."""
+
+
+def test_logs_of_success_are_silent(kernels: Path, fresh: opencl.Session) -> None:
+    """Intel's compiler writes one; pytest makes errors of warnings."""
+    assert programs.compiler_warnings(LOG) == programs.compiler_warnings("") == ""
+    assert scale(fresh, 2, np.ones(1, np.float32))[0] == 2
+
+
+def test_a_compilers_warnings_are_shown(kernels: Path, fresh: opencl.Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = f"{LOG}\nscale.cl:3:7: warning: unused variable 'i'\n1 warning generated."
+    wanted = "scale.cl:3:7: warning: unused variable 'i'\n1 warning generated."
+    assert programs.compiler_warnings(text) == wanted
+    monkeypatch.setattr(session_module, "compiler_warnings", lambda _: wanted)
+    with pytest.warns(UserWarning, match=r"^scale.cl builds on .* with warnings:\nscale.cl:3:7: warning: unused"):
+        scale(fresh, 2, np.ones(1, np.float32))
+
+
 def test_results_of_one_launch_feed_the_next(kernels: Path, fresh: opencl.Session) -> None:
     array, result = np.arange(5, dtype=np.float32), np.empty(5, np.float32)
     defines = opencl.defines_for(array.dtype)

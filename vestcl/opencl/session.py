@@ -16,6 +16,7 @@ import atexit
 import functools
 import threading
 import time
+import warnings
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from vestcl.opencl.device_list import DeviceInfo
 from vestcl.opencl.errors import DeviceError
 from vestcl.opencl.forks import refuse_after_fork, was_forked
 from vestcl.opencl.parameters import check_arguments, parameters
-from vestcl.opencl.programs import Defines, source
+from vestcl.opencl.programs import Defines, compiler_warnings, source
 from vestcl.opencl.robust_lock import Holder, RobustLock, WithBlock
 
 Buffer = cl.MemoryObjectHolder
@@ -38,6 +39,9 @@ Argument = Buffer | np.generic
 Arguments = Mapping[str, Argument]
 
 _POCL: Final = "Portable Computing Language"
+
+#: Filters of warnings are the process's: one thread at a time changes them.
+_building: Final = threading.Lock()
 
 #: Readings of a device's clock: what delays one of them does not delay the best.
 _CLOCK_READINGS: Final = 8
@@ -224,9 +228,14 @@ class Session:
         # The CPU that name_cpu() gave is not in the key of PoCL's own disk cache: a comment puts it there.
         text = f"// {pocl_cpu.host_key()}\n{source(file)}"
         try:
-            return cl.Program(self._context, text).build(options, cache_dir=None)
+            with _building, warnings.catch_warnings():
+                warnings.simplefilter("ignore", cl.CompilerWarning)  # of any log, even if it reports success
+                program = cl.Program(self._context, text).build(options, cache_dir=None)
         except cl.RuntimeError as error:
             raise DeviceError(f"{file} does not build on {self.info.name} with {' '.join(options)}:\n{error}") from None
+        if found := compiler_warnings(program.get_build_info(self._device, cl.program_build_info.LOG)):
+            warnings.warn(f"{file} builds on {self.info.name} with warnings:\n{found}", stacklevel=2)
+        return program
 
     def clock_bounds(self) -> tuple[int, int]:
         """By how much the device's clock is ahead of time.perf_counter_ns: at least and at most, nanoseconds.
@@ -373,7 +382,7 @@ class Job(Holder):
     def read(self, array: np.ndarray) -> Buffer:
         """``array`` as kernel input; on a CPU device the kernel reads the array itself."""
         assert array.flags.forc and array.size > 0
-        # Not READ_ONLY: Intel's runtime copies such an array where it is not aligned to 128 bytes, and back at every map.
+        # Not READ_ONLY: Intel's runtime copies such an array where it is not aligned to 128 bytes, at every map, too.
         shared, copied = cl.mem_flags.USE_HOST_PTR, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
         flags = shared if self.session.shares_host_memory else copied
         buffer = cl.Buffer(self.session._context, flags, hostbuf=array)

@@ -195,7 +195,10 @@ def _sections(config: OperatorsBench, _: opencl.Session, console: Console) -> It
         with console.status(operator.name), trace.stage(operator.name):
             rows += measure(operator, config.seconds, config.threads)
     size = f"{config.height}x{config.width}, C = {config.channels}, radius {config.radius:g} px, float32"
-    notes = ("x copy: over a copy of the same bytes. kernels, around: of profiled calls.",)
+    notes = (
+        "x copy: over a copy of the same bytes. Of profiled calls, kernels ms: while a kernel runs; around ms: all "
+        "the rest, which is Python, autograd, launches, and what the device's driver copies and maps.",
+    )
     plots = {
         "operators": partial(bars, columns=("ms (quartiles)", "reference ms", "copy ms")),
         "operators, kernels": partial(bars, columns=("kernels ms", "around ms")),
