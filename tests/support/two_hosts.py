@@ -2,8 +2,8 @@
 
     python tests/support/two_hosts.py
 
-prepares two streets on both, trains a small network on both, once undisturbed and once with one host lost and started
-again, and compares the weights with those of two processes on one host. Making namespaces takes root; exits with 2
+prepares two streets on both, evaluates a model on both, trains a small network on both, once undisturbed and once with
+one host lost and started again, and compares the weights with those of two processes on one host. Making namespaces takes root; exits with 2
 where that is not allowed, with 1 where weights differ by more than 1e-6.
 """
 
@@ -163,6 +163,15 @@ def prepare_on_both(hosts: Hosts, folder: Path) -> Path:
     return folder / "cache"
 
 
+def evaluate_on_both(hosts: Hosts, folder: Path) -> Path:
+    """The packaged model on two streets, one on each host; the folder of the tables."""
+    folder.mkdir(parents=True, exist_ok=True)
+    model = ROOT / "vestcl" / "weights" / "vest-s.safetensors"
+    options = ["--model", str(model), "--seeds", "1100", "1101", "--height", "96", "--width", "320"]
+    hosts.run(["-m", "train.evaluate", "street", *options, "--out", str(folder / "out")], folder)
+    return folder / "out"
+
+
 def distance(out: Path, other: Path) -> float:
     """The largest difference of two runs' weights, relative to the largest weight of its tensor."""
     pairs = [(weights(out, name), weights(other, name)) for name in ("model", "ema")]
@@ -179,6 +188,8 @@ def main() -> int:
             with Hosts() as hosts:
                 cache = prepare_on_both(hosts, folder / "prepared")
                 print("prepared:", ", ".join(sorted(path.name for path in cache.iterdir() if path.is_dir())))
+                tables = evaluate_on_both(hosts, folder / "evaluated")
+                print("evaluated:", ", ".join(sorted(path.name for path in tables.rglob("*.json"))))
                 train_on_both(hosts, cache, folder / "two")
                 train_on_both(hosts, cache, folder / "lost", lost=True)
         except NotAllowedError as error:
