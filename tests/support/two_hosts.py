@@ -3,8 +3,8 @@
     python tests/support/two_hosts.py
 
 prepares two streets on both, evaluates a model on both, trains a small network on both, once undisturbed and once with
-one host lost and started again, and compares the weights with those of two processes on one host. Making namespaces takes root; exits with 2
-where that is not allowed, with 1 where weights differ by more than 1e-6.
+one host lost and started again, and compares the weights with those of two processes on one host. Making namespaces
+takes root; exits with 2 where that is not allowed, with 1 where weights differ by more than 1e-6.
 """
 
 import contextlib
