@@ -8,7 +8,7 @@ OUT ?= out
 TEST_PROCESSES ?= 2
 PYTEST_OPTIONS := -q -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
-.PHONY: venv demo test lint test-lowest bench stress oclgrind devices-test docs tables clean
+.PHONY: venv demo test lint test-lowest bench stress oclgrind devices-test gpu-check docs tables clean
 
 venv: .venv/.installed
 
@@ -60,6 +60,10 @@ stress: venv
 # The operators' tests on every OpenCL device of this machine instead of the default one.
 devices-test: venv
 	VESTCL_TEST_DEVICES=all $(BIN)/pytest -q
+
+# The operators on every GPU, in less than five minutes; ARGUMENTS=--allow-none passes where there is none.
+gpu-check: venv
+	$(BIN)/python tests/support/gpu_check.py $(ARGUMENTS)
 
 # Data races and accesses out of bounds: every kernel on small scenes, on Oclgrind's simulated device.
 oclgrind: venv

@@ -128,7 +128,7 @@ def work_widths(working: Mapping[str, Any], whole: Mapping[str, Any]) -> Iterato
         found["geometric, at the clip's own width"] = _mean_of(others[group["input"]], frames)
         for number, (method, of) in enumerate(found.items()):
             first = "" if number else f"{_clip(group)}; {of['windows']}"
-            yield (first, METHODS.get(method, method), *(_scores(of, tuple(METRICS), k) for k in STEPS))
+            yield (first, METHODS.get(str(method), str(method)), *(_scores(of, tuple(METRICS), k) for k in STEPS))
 
 
 def _mean_of(group: Mapping[str, Any], frames: Set[int]) -> dict[str, Any]:

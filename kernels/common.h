@@ -27,3 +27,7 @@ typedef uint key_bits;
 #define JOIN(a, b) JOIN_(a, b)
 #define REAL2 JOIN(REAL, 2)
 #define REAL4 JOIN(REAL, 4)
+
+// A type that the host knows too has the size that the host takes it to have; else this does not compile.
+#define ASSERT_SIZE(type, bytes) typedef char JOIN(type, _has_the_hosts_size)[sizeof(type) == (bytes) ? 1 : -1]
+ASSERT_SIZE(REAL, REAL_BITS / 8);

@@ -99,6 +99,7 @@ kernel void rigid_flow_backward_sums(
     global REAL* restrict partial_sums)                 // [B, CHUNKS, 3, 4] out
 {
   const int i = get_global_id(0), b = get_global_id(1);
+  if (i >= CHUNKS) return;
   const int begin = (int)((long)count * i / CHUNKS), end = (int)((long)count * (i + 1) / CHUNKS);
   kahan_t x_sums = {0, 0}, y_sums = {0, 0}, z_sums = {0, 0};
   for (int n = begin; n < end; n++) {
@@ -129,12 +130,14 @@ inline REAL4 grad_normalised(REAL4 q, REAL4 gx, REAL4 gy, REAL4 gz) {
 // dL/dt = sum g;  dL/dq = (g' - q' (q' . g')) / |q| with g' = dL/dq', and g' / QUATERNION_FLOOR below the floor, where
 // q' is linear in q.
 kernel void rigid_flow_backward_motion(
+    const int batch,
     global const REAL* restrict quaternion,    // [B, 4]
     global const REAL* restrict partial_sums,  // [B, CHUNKS, 3, 4]
     global REAL* restrict grad_quaternion,     // [B, 4] out
     global REAL* restrict grad_translation)    // [B, 3] out
 {
   const int b = get_global_id(0);
+  if (b >= batch) return;
   kahan_t x_sums = {0, 0}, y_sums = {0, 0}, z_sums = {0, 0};
   for (int i = 0; i < CHUNKS; i++) {
     const size_t at = ((size_t)b * CHUNKS + i) * 3;

@@ -67,7 +67,7 @@ def test_a_command_parses(page: str, line: str) -> None:
     elif line.startswith("make "):
         assert re.search(rf"^{line.split()[1]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     else:
-        assert line.split()[0] in ("vestcl", "python3", "source", "pip", "mkdir", "python"), f"{page}: {line}"
+        assert line.split()[0] in ("vestcl", "python3", "source", "pip", "mkdir", "python", "export"), f"{page}: {line}"
 
 
 def test_readme_splats() -> None:

@@ -82,7 +82,8 @@ def _fit(options: FitOptions) -> bool:
     try:
         config = load_config(options.config, options.overrides)
         with lost_processes_named() if ranks.world > 1 else nullcontext():
-            return fit(config, go_on=options.resume or ranks.restarted, ranks=ranks, device=options.device)
+            restarted = ranks.restarted
+            return fit(config, go_on=options.resume or restarted, ranks=ranks, device=options.device)
     finally:
         ranks.leave()
 

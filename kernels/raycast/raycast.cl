@@ -81,7 +81,7 @@ static int4 cells_of(global const view_t* view, global const solid_t* s, float4 
 }
 
 kernel void project_solids(
-    const int height, const int width, const int cell_rows, const int cell_columns,
+    const int height, const int width, const int cell_rows, const int cell_columns, const int solid_count,
     global const view_t* restrict view,      // [1]
     global const solid_t* restrict solids,   // [P]
     global int4* restrict image_rects,       // [P] out, pixels
@@ -89,18 +89,20 @@ kernel void project_solids(
     global float4* restrict shadow_rects)    // [P] out, metres
 {
   const int i = get_global_id(0);
+  if (i >= solid_count) return;
   image_rects[i] = image_rect(view, solids + i, height, width);
   shadow_rects[i] = shadow_rect(view, solids + i);
   shadow_cells[i] = cells_of(view, solids + i, shadow_rects[i], cell_rows, cell_columns);
 }
 
 kernel void list_solids(
-    const int columns, const int cell, const int solid_count,
+    const int rows, const int columns, const int cell, const int solid_count,
     global const int4* restrict rects,       // [P], in units of 1 / cell
     global ushort* restrict cell_solids,     // [rows * columns, P] out, in ascending order
     global int* restrict cell_counts)        // [rows * columns] out
 {
   const int row = get_global_id(0);
+  if (row >= rows) return;
   global int* counts = cell_counts + row * columns;
   for (int c = 0; c < columns; c++) counts[c] = 0;
   for (int i = 0; i < solid_count; i++) {
@@ -190,7 +192,7 @@ static bool shade_plain(
 // Depth, label and instance are of the ray through a pixel's centre. Colour is the mean over samples x samples rays per
 // pixel in linear light, as a sensor sums it, and only then goes through the film curve: display() of a mean.
 kernel void raycast(
-    const int height, const int width, const int tile_columns, const int solid_count, const int crossing_count,
+    const int height, const int width, const int tile_rows, const int tile_columns, const int solid_count, const int crossing_count,
     const int cell_rows, const int cell_columns,
     const int samples,                           // 0 leaves colour as it is
     const int with_instances,                    // 0 leaves instances as they are
@@ -215,7 +217,7 @@ kernel void raycast(
 {
   const int tile = get_global_id(0);
   const int y = tile / tile_columns * TILE + get_global_id(1), x0 = tile % tile_columns * TILE;
-  if (y >= height) return;
+  if (tile >= tile_rows * tile_columns || y >= height) return;
   const scene_t scene = {view, solids, shadow_rects, cell_solids, cell_counts, crossings, solid_count, crossing_count,
                          cell_rows, cell_columns,
 #ifdef BENT

@@ -5,6 +5,10 @@
 #error "define SKY_DEPTH, MATERIAL_*, SHAPE_*, LABEL_* and SHADOW_CELL: see vestcl/data/street/raycast.py"
 #endif
 
+#if !defined(SOLID_BYTES) || !defined(VIEW_BYTES) || (defined(BENT) && !defined(COURSE_BYTES))
+#error "define SOLID_BYTES, VIEW_BYTES and of a bent street COURSE_BYTES, the host's sizes of the structures"
+#endif
+
 #define LANES 16  // pixels of a row that are intersected together, one 512-bit register of float
 #define TINY 1e-9f
 
@@ -21,6 +25,7 @@ typedef struct {
   uint seed;
   int instance;   // of dynamic objects; 0: static
 } solid_t;
+ASSERT_SIZE(solid_t, SOLID_BYTES);
 
 typedef struct {
   float ray[9];        // R K^-1: pixel (u, v, 1) to the direction whose z-depth is 1
@@ -32,6 +37,7 @@ typedef struct {
   float grid[2];       // x and z of the shadow grid's corner
   uint seed;
 } view_t;
+ASSERT_SIZE(view_t, VIEW_BYTES);
 
 #ifdef BENT
 // A point of a bent street's middle line, COURSE_STEP metres along it from the one before.
@@ -41,6 +47,7 @@ typedef struct {
   float curvature; // 1/m, positive to the right
   float along;     // metres along the street
 } course_t;
+ASSERT_SIZE(course_t, COURSE_BYTES);
 #endif
 
 // What a kernel knows of the scene: the solids and, per cell of a grid on the road, those whose shadow may fall there.

@@ -12,6 +12,9 @@
 #ifndef STREAM
 #error "define STREAM as 0 or 1"
 #endif
+#if VECTOR > CHANNELS || (VECTOR != 1 && VECTOR != 4 && VECTOR != 8 && VECTOR != 16)
+#error "VECTOR must be 1, 4, 8 or 16, and at most CHANNELS"
+#endif
 #define BLOCKS ((CHANNELS + VECTOR - 1) / VECTOR)
 #define BLOCK_START(k) ((k) == BLOCKS - 1 ? CHANNELS - VECTOR : (k) * VECTOR)
 #define OVERLAP (BLOCKS * VECTOR - CHANNELS)

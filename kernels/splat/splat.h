@@ -1,8 +1,15 @@
 // Geometry and vectors that the splat kernels share. A point's fragments lie in its footprint: the pixels whose
 // centres (x + 0.5, y + 0.5) are nearer to (u, v) than r.
-//   TILE   side of a square tile, pixels
+//   TILE                        side of a square tile, pixels
+//   ENTRY_BYTES, RECORD_BYTES   the host's sizes of entry_t and record_t
 #ifndef TILE
 #error "define TILE, the side of a tile in pixels"
+#endif
+#if TILE > 31
+#error "TILE must be below 32: pack_box has 5 bits for each side of a box"
+#endif
+#if !defined(ENTRY_BYTES) || !defined(RECORD_BYTES)
+#error "define ENTRY_BYTES and RECORD_BYTES, the host's sizes of entry_t and record_t"
 #endif
 #define PIXELS (TILE * TILE)
 
@@ -24,6 +31,9 @@ typedef struct { key_bits key, id; } entry_t;
 
 // One entry of a sorted tile list. box holds the footprint inside the tile, see pack_box.
 typedef struct { REAL u, v, r, o; int box, id; } record_t;
+
+ASSERT_SIZE(entry_t, ENTRY_BYTES);
+ASSERT_SIZE(record_t, RECORD_BYTES);
 
 // A footprint inside one tile, and whether the tile is the first of the point's to be traversed backward, see
 // first_box.

@@ -40,6 +40,7 @@ kernel void scan_chunks(
     global int* restrict tile_counts)  // [B, tiles] out
 {
   const int t = get_global_id(0), b = get_global_id(1);
+  if (t >= tiles) return;
   int sum = 0;
   for (int c = 0; c < chunks; c++) {
     global int* at = counts + ((size_t)b * chunks + c) * tiles + t;
@@ -103,7 +104,7 @@ inline int rank_in(global const entry_t* a, int n, key_bits key, bool equal_too)
 }
 
 // The same lists by one work-group per tile, for GPUs: merge sort, where each entry finds its rank in the other half.
-kernel void sort_tiles_together(
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void sort_tiles_together(
     const int height, const int width, const int tiles_y, const int tiles_x,
     const int step_y, const int step_x,                // of the backward, see first_box
     global const int* restrict tile_starts,            // [B * tiles + 1]
@@ -125,8 +126,10 @@ kernel void sort_tiles_together(
       const int start = i / (2 * run) * (2 * run);
       const int middle = smaller_of(start + run, n), stop = smaller_of(start + 2 * run, n);
       const key_bits key = a[i].key;
-      const int before = i < middle ? i + rank_in(a + middle, stop - middle, key, false)
-                                    : i - run + rank_in(a + start, run, key, true);
+      const bool in_order = middle == stop || a[middle - 1].key <= a[middle].key;
+      const int before = in_order     ? i
+                         : i < middle ? i + rank_in(a + middle, stop - middle, key, false)
+                                      : i - run + rank_in(a + start, run, key, true);
       b[before] = a[i];
     }
     barrier(CLK_GLOBAL_MEM_FENCE);

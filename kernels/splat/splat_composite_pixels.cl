@@ -2,14 +2,16 @@
 // splat_composite.cl.
 //
 // Forward: the group stages GROUP points of the tile's list at a time in local memory, and each work-item composites
-// those that reach its pixel. Backward, three steps, none of which adds to what another work-item writes:
+// those that reach its pixel. It goes on to the next points only if a pixel of the tile can still change. Backward, three steps, none of which adds to what another work-item writes:
 //   1. each pixel traverses its fragments forward and backward and writes w_i and dL/da_i to scratch at (entry, pixel),
 //   2. each entry sums over its pixels; entries of a point in several tiles run in several launches, as in
 //      splat_composite.cl, so that only one at a time adds to the point's gradients,
 //   3. each tile sums its pixels' share of the background's gradient.
 //
 //   CHANNELS         features per point
-//   CHANNEL_GROUP    channels that one work-item of the forward keeps in registers
+//   CHANNEL_GROUP    channels that one work-item of the forward keeps in registers: at most CHANNELS. Where it does not
+//                    divide CHANNELS, the last group overlaps the one before, so that every loop has that many turns:
+//                    an array that is indexed in any other loop would be in memory.
 #include "common.h"
 #include "splat.h"
 #ifndef CHANNELS
@@ -20,6 +22,9 @@
 #endif
 #ifndef TRUNCATE
 #error "define TRUNCATE as 0 or 1"
+#endif
+#if CHANNEL_GROUP < 1 || CHANNEL_GROUP > CHANNELS
+#error "CHANNEL_GROUP must be at least 1 and at most CHANNELS"
 #endif
 
 inline void clear_row(global REAL* row) {
@@ -54,7 +59,7 @@ inline void stage(
   }
 }
 
-kernel void composite_pixels(
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void composite_pixels(
     const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
     global const int* restrict tile_starts,   // [B * tiles + 1]
     global const record_t* restrict records,  // [E]
@@ -65,16 +70,19 @@ kernel void composite_pixels(
     global REAL* restrict coverage)           // [B, H, W] out
 {
   local record_t staged[GROUP];
-  const int lane = get_local_id(0), index = get_group_id(0), first = get_global_id(1) * CHANNEL_GROUP;
-  const int channels = smaller_of(CHANNEL_GROUP, CHANNELS - first);
+  local int last_open;  // the last e after whose points a pixel of the tile could still change
+  const int lane = get_local_id(0), index = get_group_id(0), own = get_global_id(1) * CHANNEL_GROUP;
+  const int first = smaller_of(own, CHANNELS - CHANNEL_GROUP);  // channels before `own` are another group's
   const int b = index / (tiles_y * tiles_x);
   const int x = index % tiles_x * TILE + lane % TILE, y = index / tiles_x % tiles_y * TILE + lane / TILE;
+  const bool shown = x < width && y < height;
   REAL sums[CHANNEL_GROUP];
+#pragma unroll
   for (int c = 0; c < CHANNEL_GROUP; c++) sums[c] = 0;
   REAL t = 1;
   const int begin = tile_starts[index], end = tile_starts[index + 1];
+  if (lane == 0) last_open = -1;
   for (int e = begin; e < end; e += GROUP) {
-    barrier(CLK_LOCAL_MEM_FENCE);
     stage(staged, lane, e, end, records, finite);
     barrier(CLK_LOCAL_MEM_FENCE);
     const int count = smaller_of(GROUP, end - e);
@@ -84,15 +92,20 @@ kernel void composite_pixels(
       if (!EXISTS(d2, r2, t) || t == 0) continue;
       const REAL a = staged[i].o - staged[i].o / r2 * d2, w = a * t;
       global const REAL* row = features + (size_t)staged[i].id * CHANNELS + first;
-      for (int c = 0; c < channels; c++) sums[c] += w * row[c];
+#pragma unroll
+      for (int c = 0; c < CHANNEL_GROUP; c++) sums[c] += w * row[c];
       t *= 1 - a;
     }
+    if (shown && EXISTS(0, 1, t) && t != 0) last_open = e;  // the same number from all who write it
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (last_open != e) break;  // all work-items read the same: barriers do not diverge
   }
-  if (x < width && y < height) {
+  if (shown) {
     const size_t at = ((size_t)b * height + y) * width + x;
-    if (first == 0) coverage[at] = 1 - t;
-    for (int c = 0; c < channels; c++)
-      image[at * CHANNELS + first + c] = sums[c] + t * backgrounds[b * CHANNELS + first + c];
+    if (own == 0) coverage[at] = 1 - t;
+#pragma unroll
+    for (int c = 0; c < CHANNEL_GROUP; c++)
+      if (first + c >= own) image[at * CHANNELS + first + c] = sums[c] + t * backgrounds[b * CHANNELS + first + c];
   }
 }
 
@@ -100,7 +113,7 @@ kernel void composite_pixels(
 inline int offset_in(box_t box, int x, int y) { return (y - box.y0) * (box.x1 - box.x0) + x - box.x0; }
 
 // Step 1.
-kernel void composite_pixels_backward(
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void composite_pixels_backward(
     const int height, const int width, const int tiles_y, const int tiles_x, const REAL min_transmittance,
     const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
     global const int* restrict tile_starts,     // [B * tiles + 1]
@@ -161,7 +174,7 @@ kernel void composite_pixels_backward(
 }
 
 // Step 2, for the tiles (x0 + i * step_x, y0 + j * step_y): no two of them share a point.
-kernel void sum_scratch(
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void sum_scratch(
     const int height, const int width, const int tiles_y, const int tiles_x,
     const int x0, const int y0, const int step_x, const int step_y,
     const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
@@ -220,12 +233,14 @@ kernel void sum_scratch(
 // Step 3, one work-item per channel of a tile.
 kernel void sum_tile_backgrounds(
     const int height, const int width, const int tiles_y, const int tiles_x,
+    const int tiles,  // of all images
     const long image_stride, const long row_stride, const long pixel_stride, const long channel_stride,
     global const REAL* restrict transmittance,    // [B, H, W]
     global const REAL* restrict grad_image,       // [B, C, H, W] by strides
     global REAL* restrict tile_grad_backgrounds)  // [B * tiles, C] out
 {
-  const int c = get_global_id(0), index = get_global_id(1);
+  const int i = get_global_id(0), index = i / CHANNELS, c = i % CHANNELS;
+  if (index >= tiles) return;
   const int b = index / (tiles_y * tiles_x);
   const int left = index % tiles_x * TILE, top = index / tiles_x % tiles_y * TILE;
   global const REAL* g = grad_image + b * image_stride + c * channel_stride;
@@ -236,6 +251,6 @@ kernel void sum_tile_backgrounds(
       row += transmittance[((size_t)b * height + y) * width + x] * g[y * row_stride + x * pixel_stride];
     sum += row;
   }
-  tile_grad_backgrounds[(size_t)index * CHANNELS + c] = sum;
+  tile_grad_backgrounds[i] = sum;
 }
 #endif

@@ -2,6 +2,12 @@
 //   HAS_BACKGROUNDS, HAS_GRAD_COVERAGE   0 or 1: whether these are given, or all 0
 //   GRAD_FEATURES, GRAD_POINTS_UV, GRAD_RADII, GRAD_OPACITIES, GRAD_BACKGROUNDS   0 or 1
 #ifdef GRAD_FEATURES
+#if !defined(GRAD_POINTS_UV) || !defined(GRAD_RADII) || !defined(GRAD_OPACITIES) || !defined(GRAD_BACKGROUNDS)
+#error "define all of GRAD_FEATURES, GRAD_POINTS_UV, GRAD_RADII, GRAD_OPACITIES and GRAD_BACKGROUNDS as 0 or 1"
+#endif
+#if !defined(HAS_BACKGROUNDS) || !defined(HAS_GRAD_COVERAGE)
+#error "define HAS_BACKGROUNDS and HAS_GRAD_COVERAGE as 0 or 1"
+#endif
 #define GRAD_GEOMETRY (GRAD_POINTS_UV || GRAD_RADII || GRAD_OPACITIES)
 
 // Numbers from one to the next in dL/dimage, whose memory is in any order; 0 where all are the same number.
@@ -65,11 +71,12 @@ inline REAL sum_over_tiles(int b, int c, int tiles, global const REAL* tile_grad
 
 // One work-item per channel of an image.
 kernel void sum_grad_backgrounds(
-    const int tiles,
+    const int batch, const int tiles,
     global const REAL* restrict tile_grad_backgrounds,  // [B, tiles, C]
     global REAL* restrict grad_backgrounds)             // [B, C] out
 {
-  const int c = get_global_id(0), b = get_global_id(1);
-  grad_backgrounds[b * CHANNELS + c] = sum_over_tiles(b, c, tiles, tile_grad_backgrounds);
+  const int i = get_global_id(0), b = i / CHANNELS, c = i % CHANNELS;
+  if (b >= batch) return;
+  grad_backgrounds[i] = sum_over_tiles(b, c, tiles, tile_grad_backgrounds);
 }
 #endif

@@ -69,6 +69,13 @@ inline void fetch_gradient(gradient_ahead_t* ahead) {
   ahead->next++;
 }
 
+#ifndef SEGMENT
+#error "define SEGMENT, the fragments that the backward keeps at a time"
+#endif
+#if SEGMENT < TILE * TILE
+#error "SEGMENT must be at least TILE * TILE, a point's largest footprint: no segment would hold it"
+#endif
+
 // What the backward keeps of one segment, quad by quad, and of the tile's pixels.
 typedef struct { REAL4 alpha, before; } quad_t;  // a_i and T_i, 0 and 0 where there is no fragment
 typedef struct {

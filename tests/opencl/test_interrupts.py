@@ -174,10 +174,10 @@ def test_arrays_outlive_the_kernels_of_an_interrupted_job() -> None:
     session = opencl.current()
     array, result = np.ones((1, 1, 64, 64), np.float32), np.empty((1, 4096, 3), np.float32)
     job = abandon(session.job())
-    arguments = [np.int32(64), np.int32(64), np.int32(64), job.read(array), job.read(np.eye(3, dtype=np.float32))]
-    job.launch(
-        "unproject.cl", "unproject", opencl.defines_for(array.dtype), (1, 64, 1), [*arguments, job.write(result)]
-    )
+    sizes = dict.fromkeys(("height", "width", "chunk"), np.int32(64))
+    inputs = {"depth": job.read(array), "inverse_K": job.read(np.eye(3, dtype=np.float32))}
+    arguments: opencl.Arguments = {**sizes, **inputs, "points_xyz": job.write(result)}
+    job.launch("unproject.cl", "unproject", opencl.defines_for(array.dtype), (1, 64, 1), arguments)
     held = [id(bound) for _, bound in session._bound]
     assert id(array) in held and id(result) in held
     with session.job():

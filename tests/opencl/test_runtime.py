@@ -53,7 +53,7 @@ def fresh(session: opencl.Session) -> opencl.Session:
 def scale(session: opencl.Session, factor: float, array: np.ndarray) -> np.ndarray:
     result = np.empty_like(array)
     with session.job() as job:
-        arguments = [array.dtype.type(factor), job.read(array), job.write(result)]
+        arguments = {"factor": array.dtype.type(factor), "in": job.read(array), "out": job.write(result)}
         job.launch("scale.cl", "scale", opencl.defines_for(array.dtype), array.shape, arguments)
     return result
 
@@ -207,23 +207,52 @@ def test_scalars_change_from_launch_to_launch(kernels: Path, fresh: opencl.Sessi
     assert scale(fresh, 0.1, array.astype(np.float64))[0] == 0.1
 
 
+LOG = """Compilation started
+Options used by backend compiler: -cl-std=CL1.2 -Werror -Wno-warning
+remark: <unknown>:0:0: loop not vectorized: Control flow cannot be substituted for a select
+Kernel "scale" was not vectorized
+Done."""
+
+
+def test_logs_of_success_are_silent(kernels: Path, fresh: opencl.Session) -> None:
+    """Intel's compiler writes one; pytest makes errors of warnings."""
+    assert programs.compiler_warnings(LOG) == programs.compiler_warnings("") == ""
+    assert scale(fresh, 2, np.ones(1, np.float32))[0] == 2
+
+
+def test_a_compilers_warnings_are_shown(kernels: Path, fresh: opencl.Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = f"{LOG}\nscale.cl:3:7: warning: unused variable 'i'\n1 warning generated."
+    wanted = "scale.cl:3:7: warning: unused variable 'i'\n1 warning generated."
+    assert programs.compiler_warnings(text) == wanted
+    monkeypatch.setattr(session_module, "compiler_warnings", lambda _: wanted)
+    with pytest.warns(UserWarning, match=r"^scale.cl builds on .* with warnings:\nscale.cl:3:7: warning: unused"):
+        scale(fresh, 2, np.ones(1, np.float32))
+
+
 def test_results_of_one_launch_feed_the_next(kernels: Path, fresh: opencl.Session) -> None:
     array, result = np.arange(5, dtype=np.float32), np.empty(5, np.float32)
     defines = opencl.defines_for(array.dtype)
     with fresh.job() as job:
         between = job.scratch(array.size, array.dtype)
-        job.launch("scale.cl", "scale", defines, array.shape, [np.float32(3), job.read(array), between])
-        job.launch("scale.cl", "add_one", defines, array.shape, [between, job.write(result)])
+        scaled = {"factor": np.float32(3), "in": job.read(array), "out": between}
+        job.launch("scale.cl", "scale", defines, array.shape, scaled)
+        job.launch("scale.cl", "add_one", defines, array.shape, {"in": between, "out": job.write(result)})
         job.sync()
         assert result.tolist() == [1, 4, 7, 10, 13]
 
 
-def test_a_cpu_reads_the_array_itself(kernels: Path, fresh: opencl.Session) -> None:
+@pytest.mark.parametrize("offset", [4, 64, 128, 4096])
+def test_a_cpu_reads_the_array_itself(kernels: Path, fresh: opencl.Session, offset: int) -> None:
+    """However it is aligned; even if nobody may write it."""
     if fresh.info.kind != "CPU":
         pytest.skip("this device has its own memory")
-    array, result = np.ones(8, np.float32), np.empty(8, np.float32)
+    memory, result = np.ones(3 * 4096, np.uint8), np.empty(8, np.float32)
+    start = -memory.ctypes.data % 4096 + offset
+    array = memory[start : start + 32].view(np.float32)
+    protected = array.view()
+    protected.flags.writeable = False
     with fresh.job() as job:
-        arguments: list[Any] = [np.float32(2), job.read(array), job.write(result)]
+        arguments = {"factor": np.float32(2), "in": job.read(protected), "out": job.write(result)}
         array[:] = 21  # after `read`: a copy would not see it
         job.launch("scale.cl", "scale", opencl.defines_for(array.dtype), array.shape, arguments)
     assert result.tolist() == [42] * 8
@@ -231,7 +260,7 @@ def test_a_cpu_reads_the_array_itself(kernels: Path, fresh: opencl.Session) -> N
 
 def test_a_failed_job_frees_the_session(kernels: Path, fresh: opencl.Session) -> None:
     with pytest.raises(KeyError), fresh.job() as job:
-        job.launch("scale.cl", "no_such_kernel", opencl.defines_for(np.dtype(np.float32)), (1,), [])
+        job.launch("scale.cl", "no_such_kernel", opencl.defines_for(np.dtype(np.float32)), (1,), {})
     with ThreadPoolExecutor(1) as other:
         assert other.submit(scale, fresh, 2, np.ones(1, np.float32)).result(timeout=60) == 2
 
@@ -359,9 +388,9 @@ def test_the_leftovers_of_a_failed_job_inside_another(kernels: Path, fresh: open
 
     def fail() -> None:
         with fresh.job() as inner:
-            arguments = [np.float32(2), inner.read(array), inner.write(result)]
+            arguments = {"factor": np.float32(2), "in": inner.read(array), "out": inner.write(result)}
             inner.launch("scale.cl", "scale", opencl.defines_for(array.dtype), array.shape, arguments)
-            inner.launch("scale.cl", "no_such_kernel", opencl.defines_for(array.dtype), (1,), [])
+            inner.launch("scale.cl", "no_such_kernel", opencl.defines_for(array.dtype), (1,), {})
 
     with fresh.job() as outer:
         with pytest.raises(KeyError):

@@ -81,8 +81,8 @@ def test_counters_are_bounded_on_any_number_of_units(
     reference = bits(5)
     monkeypatch.setattr(mapped_session, "info", dataclasses.replace(mapped_session.info, compute_units=100_000))
     monkeypatch.setattr(_splat_lists, "MAX_COUNTERS", most)
-    chunks = _splat_lists.chunks_of(mapped_session, 10**9, counters)
-    assert chunks >= 1 and (chunks == 1 or chunks * counters <= most)
+    chunks, group = _splat_lists.chunks_of(mapped_session, 10**9, counters)
+    assert chunks >= 1 and (chunks == 1 or chunks * counters <= most) and chunks % group == 0
     assert bits(5) == reference
 
 

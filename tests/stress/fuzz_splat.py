@@ -1,6 +1,6 @@
 """Random small scenes through `splat`, forward and all gradients, against a reference of its own in float64 NumPy.
 
-    python tests/stress/fuzz_splat.py [--share 1.0] [--seed 0] [--scene 123]
+    python tests/stress/fuzz_splat.py [--share 1.0] [--seed 0] [--scene 123] [--mapping pixel]
 
 The reference composites densely, every point at every pixel, and carries a bound along of what the operator's
 roundings may change: each operation of its formula adds its own rounding to what its operands bring. The unit is the
@@ -13,6 +13,7 @@ lies behind may show or not: that pixel is left out of the comparison, and of th
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
@@ -35,6 +36,7 @@ EXACT: Final = 1 / 16
 EXACT_TO: Final = 100.0
 TRUNCATIONS: Final = (1e-4, 0.01, 0.1, 0.3, 0.5, 0.9)
 SHOWN_FAILURES: Final = 10
+MAPPINGS: Final = ("tile", "pixel")
 
 Array = np.ndarray[Any, Any]
 
@@ -79,12 +81,12 @@ class Tally:
 # ---------------------------------------------------------------- scenes
 
 
-def programs(count: int, rng: np.random.Generator) -> list[Program]:
+def programs(count: int, rng: np.random.Generator, mappings: Sequence[str] = MAPPINGS) -> list[Program]:
     """The first ones are those that the operator's own tests build as well."""
     dtypes = ("float32", "float64") if opencl.current().info.float64 else ("float32",)
     plain = [
         Program(dtype, mapping, truncate, 3 if truncate else 5)
-        for dtype in dtypes for mapping in ("tile", "pixel") for truncate in (False, True)
+        for dtype in dtypes for mapping in mappings for truncate in (False, True)
     ]  # fmt: skip
     chosen = list(plain)
     while len(chosen) < count:
@@ -390,10 +392,10 @@ def compare(what: str, got: Array, wanted: Bounded, program: Program, tally: Tal
         tally.failures.append(f"{where} is {values} ({program})")
 
 
-def run(share: float, seed: int, only: int | None = None) -> Tally:
+def run(share: float, seed: int, only: int | None = None, mappings: Sequence[str] = MAPPINGS) -> Tally:
     """Check ``share`` of the scenes, or only scene ``only`` of them."""
     count = round(SCENES * share)
-    chosen = programs(max(8, round(PROGRAMS * share)), np.random.default_rng(seed))
+    chosen = programs(max(8, round(PROGRAMS * share)), np.random.default_rng(seed), mappings)
     tally = Tally()
     for index in range(count) if only is None else [only]:
         check_scene(index, seed, chosen[index % len(chosen)], tally)
@@ -405,9 +407,11 @@ def main() -> int:
     parser.add_argument("--share", type=float, default=1.0, help=f"part of the {SCENES} scenes (default: 1)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--scene", type=int, help="check this scene only")
+    parser.add_argument("--mapping", choices=MAPPINGS, help="of the kernels, as in vestcl.use (default: both)")
     options = parser.parse_args()
     started = time.monotonic()
-    tally = run(options.share, options.seed, options.scene)
+    mappings = (options.mapping,) if options.mapping else MAPPINGS
+    tally = run(options.share, options.seed, options.scene, mappings)
     median = np.median(tally.bounds) if tally.bounds else 0.0
     print(
         f"fuzz_splat: {tally.scenes} scenes, {tally.fragments} fragments, {len(tally.failures)} failures in "
@@ -418,7 +422,8 @@ def main() -> int:
     for failure in tally.failures[:SHOWN_FAILURES]:
         print(f"  {failure}")
     if tally.failures:
-        print(f"Repeat one with --share {options.share} --seed {options.seed} --scene N")
+        mapping = f" --mapping {options.mapping}" if options.mapping else ""
+        print(f"Repeat one with --share {options.share} --seed {options.seed}{mapping} --scene N")
     return 1 if tally.failures else 0
 
 

@@ -87,6 +87,7 @@ def splatting(dtype: torch.dtype) -> None:
     backward(*composite(empty, recorded(2, 0, 3, dtype=dtype), recorded(2, 3, dtype=dtype)))
     crowded = rasterize(**geometry(80, dtype, radius=80))
     backward(*composite(crowded, recorded(2, 80, 3, dtype=dtype)))
+    composite(rasterize(**geometry(300, dtype, radius=80)), torch.rand(2, 300, 1, dtype=dtype))  # more than a group
 
 
 def splat_and_small_operators() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import two_hosts
 from torch import distributed
 from train_scenes import MODELS, MOMENT, ROOT, configured, steps, street, weights, write_yaml
 
@@ -157,3 +158,18 @@ def test_started_again_they_reach_the_same_weights(
         assert torch.equal(flat(weights(out, name)), flat(weights(two, name))), name
     assert [row["step"] for row in read_log(out / LOG)] == list(range(1, 9))
     assert len(list((out / "tensorboard").iterdir())) == 2  # once a start
+
+
+def test_two_hosts_of_which_one_is_lost_reach_the_same_weights(
+    two: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Both processes of a host that is started again count its starts from 0, and resume all the same."""
+    try:
+        with two_hosts.Hosts() as hosts:
+            reported = two_hosts.train_on_both(hosts, street(tmp_path_factory), tmp_path, lost=True)
+    except two_hosts.NotAllowedError as error:
+        pytest.skip(f"two hosts can't be made here: {error}")
+    assert "error: another process of this run can't be reached or has ended (" in reported
+    assert "from step 4 to step 8, 2 processes" in reported
+    assert two_hosts.distance(tmp_path / "out", two) <= two_hosts.SAME
+    assert [row["step"] for row in read_log(tmp_path / "out" / LOG)] == list(range(1, 9))

@@ -56,8 +56,9 @@ class Ranks:
             _check_address()
             with lost_processes_named():
                 store, rank, world = next(rendezvous("env://", timeout=PATIENCE))
-                fresh = PrefixStore(f"start {_restarts()}", store)  # torchrun's has the lost ones' addresses
-                distributed.init_process_group("gloo", timeout=PATIENCE, store=fresh, rank=rank, world_size=world)
+                if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True":  # it has the lost ones' addresses
+                    store = PrefixStore(f"start {_restarts()}", store)
+                distributed.init_process_group("gloo", timeout=PATIENCE, store=store, rank=rank, world_size=world)
         return cls(distributed.get_rank(), distributed.get_world_size(), local)
 
     @property
@@ -67,8 +68,11 @@ class Ranks:
 
     @property
     def restarted(self) -> bool:
-        """Whether torchrun has started the processes again after one was lost."""
-        return _restarts() > 0
+        """Whether torchrun has started the processes again after one was lost; all get the same answer.
+
+        A host that took a lost one's place counts from 0.
+        """
+        return self.any(_restarts() > 0)
 
     def any(self, flag: bool) -> bool:
         """Whether it is true in any process; all get the same answer."""

@@ -52,3 +52,9 @@ def defines_for(dtype: np.dtype, **more: str | int) -> dict[str, str | int]:
         "TILE": constants.TILE,
         **more,
     }
+
+
+def compiler_warnings(log: str) -> str:
+    """The lines of a build's log that warn. Intel's compiler reports there what it did, and its options."""
+    lines = (line for line in log.splitlines() if not line.startswith("Options used by backend compiler"))
+    return "\n".join(line for line in lines if re.search(r"\b(warning|error)\b", line, re.IGNORECASE))

@@ -5,7 +5,8 @@ makes the results visible::
 
     session = opencl.current()
     with session.job() as job:
-        job.launch("unproject.cl", "unproject", {"REAL": "float"}, (count,), [np.int32(count), job.read(depth), ...])
+        arguments = {"count": np.int32(count), "depth": job.read(depth), ...}
+        job.launch("unproject.cl", "unproject", {"REAL": "float"}, (count,), arguments)
 
 An exception may come up between any two bytecodes (KeyboardInterrupt does). What an interrupted job leaves behind, the
 next one clears away: it waits for kernels that still run, and only then lets go of their arrays.
@@ -15,8 +16,9 @@ import atexit
 import functools
 import threading
 import time
+import warnings
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -28,13 +30,18 @@ from vestcl.opencl import forks, pocl_cache, pocl_cpu
 from vestcl.opencl.device_list import DeviceInfo
 from vestcl.opencl.errors import DeviceError
 from vestcl.opencl.forks import refuse_after_fork, was_forked
-from vestcl.opencl.programs import Defines, source
+from vestcl.opencl.parameters import check_arguments, parameters
+from vestcl.opencl.programs import Defines, compiler_warnings, source
 from vestcl.opencl.robust_lock import Holder, RobustLock, WithBlock
 
 Buffer = cl.MemoryObjectHolder
 Argument = Buffer | np.generic
+Arguments = Mapping[str, Argument]
 
 _POCL: Final = "Portable Computing Language"
+
+#: Filters of warnings are the process's: one thread at a time changes them.
+_building: Final = threading.Lock()
 
 #: Readings of a device's clock: what delays one of them does not delay the best.
 _CLOCK_READINGS: Final = 8
@@ -141,8 +148,8 @@ class Session:
         self._device = device
         self._plain_queue = self._queue = cl.CommandQueue(self._context)
         self._kernels: dict[tuple[str, tuple[tuple[str, str | int], ...]], dict[str, cl.Kernel]] = {}
-        self._typed_kernels: dict[tuple[Any, ...], cl.Kernel] = {}
-        """By file, name and defines in the order they came in."""
+        self._typed_kernels: dict[tuple[Any, ...], tuple[cl.Kernel, tuple[str, ...]]] = {}
+        """By file, name and defines in the order they came in; each with the names of its parameters."""
         #: Results are in the arrays of `Job.write` as soon as a kernel is done; else only after `Job.sync`.
         self.writes_host_memory = self.shares_host_memory and info.platform == _POCL and self._fills_host_memory()
         self._pool = cl.tools.MemoryPool(cl.tools.ImmediateAllocator(self._queue))
@@ -184,8 +191,10 @@ class Session:
             self._kernels[key] = {kernel.function_name: kernel for kernel in program.all_kernels()}
         return self._kernels[key][name]
 
-    def _typed_kernel(self, file: str, name: str, defines: Defines, arguments: Sequence[Argument]) -> cl.Kernel:
-        """`kernel`, its scalars of the types that these have, which every launch gives it.
+    def _typed_kernel(
+        self, file: str, name: str, defines: Defines, arguments: Arguments
+    ) -> tuple[cl.Kernel, tuple[str, ...]]:
+        """`kernel`, and the names of its parameters; its first launch shows that ``arguments`` fit them.
 
         Without types pyopencl tries to read each scalar as a buffer first: 9 us each, 2 us for all of them with types.
         """
@@ -193,8 +202,10 @@ class Session:
         key = (file, name, *defines.items())
         if key not in self._typed_kernels:
             kernel = self.kernel(file, name, defines)
-            kernel.set_scalar_arg_dtypes([type(a) if isinstance(a, np.generic) else None for a in arguments])
-            self._typed_kernels[key] = kernel
+            wanted = parameters(source(file), name, defines)
+            check_arguments(f"kernel {name} of {file}", wanted, arguments)
+            kernel.set_scalar_arg_dtypes([parameter.scalar for parameter in wanted])
+            self._typed_kernels[key] = kernel, tuple(parameter.name for parameter in wanted)
         return self._typed_kernels[key]
 
     def _fills_host_memory(self) -> bool:
@@ -217,9 +228,14 @@ class Session:
         # The CPU that name_cpu() gave is not in the key of PoCL's own disk cache: a comment puts it there.
         text = f"// {pocl_cpu.host_key()}\n{source(file)}"
         try:
-            return cl.Program(self._context, text).build(options, cache_dir=None)
+            with _building, warnings.catch_warnings():
+                warnings.simplefilter("ignore", cl.CompilerWarning)  # of any log, even if it reports success
+                program = cl.Program(self._context, text).build(options, cache_dir=None)
         except cl.RuntimeError as error:
             raise DeviceError(f"{file} does not build on {self.info.name} with {' '.join(options)}:\n{error}") from None
+        if found := compiler_warnings(program.get_build_info(self._device, cl.program_build_info.LOG)):
+            warnings.warn(f"{file} builds on {self.info.name} with warnings:\n{found}", stacklevel=2)
+        return program
 
     def clock_bounds(self) -> tuple[int, int]:
         """By how much the device's clock is ahead of time.perf_counter_ns: at least and at most, nanoseconds.
@@ -366,8 +382,10 @@ class Job(Holder):
     def read(self, array: np.ndarray) -> Buffer:
         """``array`` as kernel input; on a CPU device the kernel reads the array itself."""
         assert array.flags.forc and array.size > 0
-        where = cl.mem_flags.USE_HOST_PTR if self.session.shares_host_memory else cl.mem_flags.COPY_HOST_PTR
-        buffer = cl.Buffer(self.session._context, cl.mem_flags.READ_ONLY | where, hostbuf=array)
+        # Not READ_ONLY: Intel's runtime copies such an array where it is not aligned to 128 bytes, at every map, too.
+        shared, copied = cl.mem_flags.USE_HOST_PTR, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
+        flags = shared if self.session.shares_host_memory else copied
+        buffer = cl.Buffer(self.session._context, flags, hostbuf=array)
         self.session._bound.append((buffer, array))
         return buffer
 
@@ -393,13 +411,17 @@ class Job(Holder):
         name: str,
         defines: Defines,
         global_size: Sequence[int],
-        arguments: Sequence[Argument],
+        arguments: Arguments,
         local_size: Sequence[int] | None = None,
     ) -> None:
-        """Enqueue kernel ``name``; scalars come as NumPy scalars of the exact C type."""
+        """Enqueue kernel ``name``; arguments go by its parameters' names, scalars as NumPy scalars of the exact C type.
+
+        Raises:
+            TypeError: at the kernel's first launch, arguments that do not fit it.
+        """
         session = self.session
-        kernel = session._typed_kernel(file, name, defines, arguments)
-        values: Sequence[Any] = arguments  # pyopencl's type for them leaves out its own pooled buffers
+        kernel, names = session._typed_kernel(file, name, defines, arguments)
+        values: list[Any] = [arguments[name] for name in names]  # pyopencl's type leaves out its own pooled buffers
         kernel.set_args(*values)
         local = tuple(local_size) if local_size else (1,) * len(global_size)
         profiles = tuple(session._profiles)

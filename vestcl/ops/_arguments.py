@@ -25,9 +25,6 @@ OPTIONAL: Final = " | None"
 #: enough that one frame (2e5 points) keeps 64 cores busy.
 CPU_CHUNK: Final = 2048
 
-#: Work-items in a work-group of a GPU: two warps of NVIDIA, one wavefront of AMD.
-GPU_GROUP: Final = 64
-
 
 def check_arguments(**arguments: tuple[Any, str]) -> dict[str, int]:
     """Check operator arguments against their shapes; the sizes that the letters denote.
@@ -195,4 +192,4 @@ def work_items(session: opencl.Session, count: int) -> WorkItems:
     """
     if session.mapping == "tile":
         return WorkItems(np.int32(CPU_CHUNK), -(-count // CPU_CHUNK), 1)
-    return WorkItems(np.int32(1), -(-count // GPU_GROUP) * GPU_GROUP, GPU_GROUP)
+    return WorkItems(np.int32(1), *opencl.grouped(session, count))

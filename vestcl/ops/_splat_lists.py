@@ -45,6 +45,10 @@ class Geometry:
     def batch(self) -> int:
         return len(self.cloud_starts) - 1
 
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return self.z.dtype
+
     @functools.cached_property
     def grid(self) -> tuple[int, int]:
         """Rows and columns of tiles."""
@@ -57,9 +61,10 @@ class Geometry:
         return rows * columns
 
     @functools.cached_property
-    def sizes(self) -> list[np.int32]:
+    def sizes(self) -> dict[str, opencl.Argument]:
         """The first arguments of every kernel."""
-        return [np.int32(n) for n in (self.height, self.width, *self.grid)]
+        names = ("height", "width", "tiles_y", "tiles_x")
+        return {name: np.int32(n) for name, n in zip(names, (self.height, self.width, *self.grid), strict=True)}
 
 
 @dataclass(frozen=True)
@@ -88,10 +93,16 @@ class TileLists:
         return _steps(self.extent, self.grid)
 
 
-def chunks_of(session: opencl.Session, points: int, counters: int) -> int:
-    """Work-items that share ``points``, with ``counters`` numbers each. No result depends on it."""
-    chunks = CHUNKS_PER_UNIT * session.info.compute_units if session.mapping == "tile" else points // GPU_CHUNK
-    return max(1, min(chunks, MAX_COUNTERS // counters))
+def chunks_of(session: opencl.Session, points: int, counters: int) -> tuple[int, int]:
+    """Work-items that share ``points``, with ``counters`` numbers each, and how many of them are a work-group.
+
+    No result depends on it.
+    """
+    most = max(1, MAX_COUNTERS // counters)
+    if session.mapping == "tile":
+        return min(CHUNKS_PER_UNIT * session.info.compute_units, most), 1
+    group = min(opencl.GPU_GROUP, most)
+    return min(-(-points // (GPU_CHUNK * group)), most // group) * group, group
 
 
 def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
@@ -104,29 +115,37 @@ def list_tiles(session: opencl.Session, geometry: Geometry) -> TileLists:
         intersections = job.scratch(geometry.points, np.int32)
         if geometry.points == 0:
             return _sort(job, geometry, _starts(tile_counts), np.ones((), np.int32), intersections, None)
-        chunks = chunks_of(session, geometry.points // geometry.batch, geometry.tiles * geometry.batch)
+        mean_points = -(-geometry.points // geometry.batch)
+        chunks, group = chunks_of(session, mean_points, geometry.tiles * geometry.batch)
         extents = np.ones((geometry.batch, chunks), np.int32)
-        starts, points_uv, z, radii, opacities = (
-            job.read(array)
-            for array in (geometry.cloud_starts, geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
-        )
-        transparent = np.int32(geometry.list_transparent)
-        counts = job.scratch(geometry.batch * chunks * geometry.tiles, np.int32)
+        opacities, transparent = job.read(geometry.opacities), np.int32(geometry.list_transparent)
+        shared = geometry.sizes | {
+            "cloud_starts": job.read(geometry.cloud_starts),
+            "points_uv": job.read(geometry.points_uv),
+            "z": job.read(geometry.z),
+            "radii": job.read(geometry.radii),
+            "intersections": intersections,
+            "counts": job.scratch(geometry.batch * chunks * geometry.tiles, np.int32),
+        }
         job.launch(
             "splat/splat_bin.cl", "count_tiles", defines, (chunks, geometry.batch),
-            [*geometry.sizes, starts, points_uv, z, radii, opacities, transparent, intersections, counts,
-             job.write(extents)],
+            {**shared, "opacities": opacities, "list_transparent": transparent, "extents": job.write(extents)},
+            (group, 1),
         )  # fmt: skip
+        items, together = opencl.grouped(session, geometry.tiles)
         job.launch(
-            "splat/splat_bin.cl", "scan_chunks", defines, (geometry.tiles, geometry.batch),
-            [np.int32(chunks), np.int32(geometry.tiles), counts, job.write(tile_counts)],
+            "splat/splat_bin.cl", "scan_chunks", defines, (items, geometry.batch),
+            {"chunks": np.int32(chunks), "tiles": np.int32(geometry.tiles), "counts": shared["counts"],
+             "tile_counts": job.write(tile_counts)},
+            (together, 1),
         )  # fmt: skip
         job.sync()
         tile_starts = _starts(tile_counts)
-        entries = job.scratch(int(tile_starts[-1]), _entry_type(geometry))
+        entries = job.scratch(int(tile_starts[-1]), entry_type(geometry.dtype))
         job.launch(
             "splat/splat_bin.cl", "fill_tiles", defines, (chunks, geometry.batch),
-            [*geometry.sizes, starts, points_uv, z, radii, intersections, job.read(tile_starts), counts, entries],
+            {**shared, "tile_starts": job.read(tile_starts), "entries": entries},
+            (group, 1),
         )  # fmt: skip
         return _sort(job, geometry, tile_starts, extents.max(), intersections, entries)
 
@@ -142,17 +161,25 @@ def _list_few(session: opencl.Session, geometry: Geometry, defines: dict[str, st
     tiles, pairs = geometry.batch * geometry.tiles, geometry.points * geometry.tiles
     tile_starts, tile_scratch, extent = np.empty(tiles + 1, np.int32), np.empty(tiles, np.int64), np.empty((), np.int32)
     with session.job() as job:
-        arrays = (geometry.cloud_starts, geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
-        intersections, counts = job.scratch(geometry.points, np.int32), job.scratch(tiles, np.int32)
-        entries, scratch = (job.scratch(pairs, _entry_type(geometry)) for _ in range(2))
-        records = job.scratch(pairs, _record_type(geometry))
-        scalars, transparent = [*geometry.sizes, np.int32(geometry.batch)], np.int32(geometry.list_transparent)
-        job.launch(
-            "splat/splat_bin_few.cl", "list_few", defines, (1,),
-            [*scalars, *(job.read(array) for array in arrays), transparent,
-             intersections, counts, entries, scratch, records,
-             *(job.write(array) for array in (tile_starts, tile_scratch, extent))],
-        )  # fmt: skip
+        intersections, records = job.scratch(geometry.points, np.int32), job.scratch(pairs, record_type(geometry.dtype))
+        arguments: opencl.Arguments = geometry.sizes | {
+            "batch": np.int32(geometry.batch),
+            "cloud_starts": job.read(geometry.cloud_starts),
+            "points_uv": job.read(geometry.points_uv),
+            "z": job.read(geometry.z),
+            "radii": job.read(geometry.radii),
+            "opacities": job.read(geometry.opacities),
+            "list_transparent": np.int32(geometry.list_transparent),
+            "intersections": intersections,
+            "next": job.scratch(tiles, np.int32),
+            "entries": job.scratch(pairs, entry_type(geometry.dtype)),
+            "scratch": job.scratch(pairs, entry_type(geometry.dtype)),
+            "records": records,
+            "tile_starts": job.write(tile_starts),
+            "tile_scratch": job.write(tile_scratch),
+            "extent": job.write(extent),
+        }
+        job.launch("splat/splat_bin_few.cl", "list_few", defines, (1,), arguments)
         none = job.scratch(0, np.int64)
         return TileLists(session, tile_starts, tile_scratch, extent, geometry.grid, records, intersections, none)
 
@@ -162,8 +189,25 @@ def _steps(extent: Array, grid: tuple[int, int]) -> tuple[int, int]:
     return min(int(extent), rows), min(int(extent), columns)
 
 
+def entry_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """entry_t of kernels/splat/splat.h."""
+    bits = np.dtype(f"u{dtype.itemsize}")
+    return np.dtype([("key", bits), ("id", bits)])
+
+
+def record_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """record_t of kernels/splat/splat.h."""
+    return np.dtype([*((name, dtype) for name in "uvro"), ("box", np.int32), ("id", np.int32)])
+
+
+def splat_defines(dtype: np.dtype[Any], **more: str | int) -> dict[str, str | int]:
+    """What every splat kernel is built with: it asserts that its structures have these sizes."""
+    sizes = {"ENTRY_BYTES": entry_type(dtype).itemsize, "RECORD_BYTES": record_type(dtype).itemsize}
+    return opencl.defines_for(dtype, **sizes, **more)
+
+
 def _defines(session: opencl.Session, geometry: Geometry) -> dict[str, str | int]:
-    return opencl.defines_for(geometry.z.dtype, BUILTINS=int(session.compiles_builtins))
+    return splat_defines(geometry.dtype, BUILTINS=int(session.compiles_builtins))
 
 
 def _starts(tile_counts: Array) -> Array:
@@ -172,14 +216,6 @@ def _starts(tile_counts: Array) -> Array:
     if starts[-1] >= 2**31:
         raise ValueError(f"`radii` must make fewer than 2**31 pairs of a point and a tile, got {starts[-1]}")
     return starts.astype(np.int32)
-
-
-def _entry_type(geometry: Geometry) -> np.dtype[Any]:
-    return np.dtype(f"V{2 * geometry.z.dtype.itemsize}")
-
-
-def _record_type(geometry: Geometry) -> np.dtype[Any]:
-    return np.dtype(f"V{4 * geometry.z.dtype.itemsize + 8}")
 
 
 def _sort(
@@ -194,20 +230,28 @@ def _sort(
     count, tiles = int(tile_starts[-1]), len(tile_starts) - 1
     steps = _steps(extent, geometry.grid)
     together = job.session.mapping == "pixel"
-    records = job.scratch(count, _record_type(geometry))
+    records = job.scratch(count, record_type(geometry.dtype))
     entry_offsets = job.scratch(count if together else 0, np.int64)
     tile_scratch = np.zeros(tiles, np.int64)
     if entries is not None and count:
-        arrays = (tile_starts, geometry.points_uv, geometry.radii, geometry.opacities)
-        scratch = job.scratch(count, _entry_type(geometry))
-        arguments: list[opencl.Argument] = [*geometry.sizes, *map(np.int32, steps), *map(job.read, arrays)]
-        arguments += [entries, scratch, records, job.write(tile_scratch)]
+        arguments = geometry.sizes | {
+            "step_y": np.int32(steps[0]),
+            "step_x": np.int32(steps[1]),
+            "tile_starts": job.read(tile_starts),
+            "points_uv": job.read(geometry.points_uv),
+            "radii": job.read(geometry.radii),
+            "opacities": job.read(geometry.opacities),
+            "entries": entries,
+            "scratch": job.scratch(count, entry_type(geometry.dtype)),
+            "records": records,
+            "tile_scratch": job.write(tile_scratch),
+        }
         defines = _defines(job.session, geometry)
         if together:
             group = constants.TILE**2
             job.launch(
                 "splat/splat_bin.cl", "sort_tiles_together", defines | {"TOGETHER": 1}, (tiles * group,),
-                [*arguments, entry_offsets], (group,),
+                {**arguments, "entry_offsets": entry_offsets}, (group,),
             )  # fmt: skip
         else:
             job.launch("splat/splat_bin.cl", "sort_tiles", defines, (tiles,), arguments)

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from vestcl import opencl
-from vestcl.ops._splat_lists import Geometry, TileLists, chunks_of
+from vestcl.ops._splat_lists import Geometry, TileLists, chunks_of, splat_defines
 
 #: Why a point is in no list, in the order in which the kernel asks and counts.
 REASONS: Final = ("not_finite", "behind", "no_radius", "outside", "transparent")
@@ -47,13 +47,20 @@ def count_culled(geometry: Geometry, lists: TileLists) -> dict[str, int]:
     """Points that are in no list, by `REASONS`."""
     if geometry.points == 0:
         return dict.fromkeys(REASONS, 0)
-    counts = np.zeros((chunks_of(lists.session, geometry.points, len(REASONS)), len(REASONS)), np.int32)
-    sizes = [np.int32(n) for n in (geometry.height, geometry.width, geometry.points)]
-    arrays = (geometry.points_uv, geometry.z, geometry.radii, geometry.opacities)
-    defines = opencl.defines_for(geometry.z.dtype)
+    chunks, group = chunks_of(lists.session, geometry.points, len(REASONS))
+    counts = np.zeros((chunks, len(REASONS)), np.int32)
     with lists.session.job() as job:
-        job.launch(
-            "splat/splat_skipped.cl", "count_skipped", defines, (len(counts),),
-            [*sizes, *map(job.read, arrays), lists.intersections, job.write(counts)],
-        )  # fmt: skip
+        arguments: opencl.Arguments = {
+            "height": np.int32(geometry.height),
+            "width": np.int32(geometry.width),
+            "points": np.int32(geometry.points),
+            "points_uv": job.read(geometry.points_uv),
+            "z": job.read(geometry.z),
+            "radii": job.read(geometry.radii),
+            "opacities": job.read(geometry.opacities),
+            "intersections": lists.intersections,
+            "skipped": job.write(counts),
+        }
+        defines = splat_defines(geometry.dtype)
+        job.launch("splat/splat_skipped.cl", "count_skipped", defines, (chunks,), arguments, (group,))
     return {reason: int(count) for reason, count in zip(REASONS, counts.sum(axis=0), strict=True)}

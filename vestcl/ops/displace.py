@@ -101,8 +101,15 @@ def _forward(
     if z.size:
         chunk, items, group = work_items(session, count)
         with session.job() as job:
-            inputs = [job.read(array) for array in (points_xyz, displacement_xyz, projection)]
-            arguments: list[opencl.Argument] = [np.int32(count), chunk, *inputs, job.write(points_uv), job.write(z)]
+            arguments: opencl.Arguments = {
+                "count": np.int32(count),
+                "chunk": chunk,
+                "points_xyz": job.read(points_xyz),
+                "displacement_xyz": job.read(displacement_xyz),
+                "projection": job.read(projection),
+                "points_uv": job.write(points_uv),
+                "z": job.write(z),
+            }
             defines = opencl.defines_for(z.dtype)
             job.launch("displace.cl", "displace", defines, (items, batch), arguments, (group, 1))
     return points_uv, z
@@ -122,9 +129,16 @@ def _backward(
     if grad_xyz.size:
         chunk, items, group = work_items(session, count)
         with session.job() as job:
-            arrays = points_xyz, displacement_xyz, projection, grad_points_uv, grad_z
-            inputs = [job.read(array) for array in arrays]
-            arguments: list[opencl.Argument] = [np.int32(count), chunk, *inputs, job.write(grad_xyz)]
+            arguments: opencl.Arguments = {
+                "count": np.int32(count),
+                "chunk": chunk,
+                "points_xyz": job.read(points_xyz),
+                "displacement_xyz": job.read(displacement_xyz),
+                "projection": job.read(projection),
+                "grad_points_uv": job.read(grad_points_uv),
+                "grad_z": job.read(grad_z),
+                "grad_xyz": job.write(grad_xyz),
+            }
             defines = opencl.defines_for(grad_xyz.dtype)
             job.launch("displace.cl", "displace_backward", defines, (items, batch), arguments, (group, 1))
     return grad_xyz

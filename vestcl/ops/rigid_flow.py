@@ -82,8 +82,14 @@ def _forward(
     if displacement_xyz.size:
         chunk, items, group = work_items(session, count)
         with session.job() as job:
-            inputs = [job.read(array) for array in (points_xyz, quaternion, translation)]
-            arguments: list[opencl.Argument] = [np.int32(count), chunk, *inputs, job.write(displacement_xyz)]
+            arguments: opencl.Arguments = {
+                "count": np.int32(count),
+                "chunk": chunk,
+                "points_xyz": job.read(points_xyz),
+                "quaternion": job.read(quaternion),
+                "translation": job.read(translation),
+                "displacement_xyz": job.write(displacement_xyz),
+            }
             defines = _defines(points_xyz.dtype)
             job.launch("rigid_flow.cl", "rigid_flow", defines, (items, batch), arguments, (group, 1))
     return displacement_xyz
@@ -118,8 +124,14 @@ def _backward_points(
     if grad_points_xyz.size:
         chunk, items, group = work_items(session, count)
         with session.job() as job:
-            inputs = [job.read(array) for array in (points_xyz, quaternion, grad_displacement_xyz)]
-            arguments: list[opencl.Argument] = [np.int32(count), chunk, *inputs, job.write(grad_points_xyz)]
+            arguments: opencl.Arguments = {
+                "count": np.int32(count),
+                "chunk": chunk,
+                "points_xyz": job.read(points_xyz),
+                "quaternion": job.read(quaternion),
+                "grad_displacement_xyz": job.read(grad_displacement_xyz),
+                "grad_points_xyz": job.write(grad_points_xyz),
+            }
             defines = _defines(points_xyz.dtype)
             job.launch("rigid_flow.cl", "rigid_flow_backward_points", defines, (items, batch), arguments, (group, 1))
     return grad_points_xyz
@@ -135,11 +147,22 @@ def _backward_motion(
     if points_xyz.size:
         defines = _defines(points_xyz.dtype)
         with session.job() as job:
+            items, group = opencl.grouped(session, CHUNKS)
             partial_sums = job.scratch(batch * CHUNKS * 3 * 4, points_xyz.dtype)
-            inputs = [job.read(points_xyz), job.read(grad_displacement_xyz)]
-            arguments: list[opencl.Argument] = [np.int32(count), *inputs, partial_sums]
-            job.launch("rigid_flow.cl", "rigid_flow_backward_sums", defines, (CHUNKS, batch), arguments)
-            outputs = [job.write(grad_quaternion), job.write(grad_translation)]
-            arguments = [job.read(quaternion), partial_sums, *outputs]
-            job.launch("rigid_flow.cl", "rigid_flow_backward_motion", defines, (batch,), arguments)
+            arguments: opencl.Arguments = {
+                "count": np.int32(count),
+                "points_xyz": job.read(points_xyz),
+                "grad_displacement_xyz": job.read(grad_displacement_xyz),
+                "partial_sums": partial_sums,
+            }
+            job.launch("rigid_flow.cl", "rigid_flow_backward_sums", defines, (items, batch), arguments, (group, 1))
+            arguments = {
+                "batch": np.int32(batch),
+                "quaternion": job.read(quaternion),
+                "partial_sums": partial_sums,
+                "grad_quaternion": job.write(grad_quaternion),
+                "grad_translation": job.write(grad_translation),
+            }
+            items, group = opencl.grouped(session, batch)
+            job.launch("rigid_flow.cl", "rigid_flow_backward_motion", defines, (items,), arguments, (group,))
     return grad_quaternion, grad_translation

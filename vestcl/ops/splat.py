@@ -9,7 +9,8 @@ import torch
 from vestcl import constants, opencl
 from vestcl.ops._arguments import Array, as_array, check_arguments, check_starts, require_no_grad, require_ordinary
 from vestcl.ops._autograd import Gradients, differentiable_once, untraced
-from vestcl.ops._splat_composite import Layer, NeedsGrad, composite_backward, composite_forward
+from vestcl.ops._splat_composite import NeedsGrad, composite_backward, composite_forward
+from vestcl.ops._splat_layer import Layer
 from vestcl.ops._splat_lists import Geometry, TileLists, list_tiles
 from vestcl.ops._splat_skipped import Skipped, count_culled
 

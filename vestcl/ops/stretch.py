@@ -49,9 +49,16 @@ def _stretch(session: opencl.Session, points_uv: np.ndarray, magnified: np.ndarr
     factor, opacity = np.empty_like(magnified), np.empty_like(magnified)
     if magnified.size:
         chunk, items, group = work_items(session, width)
-        sizes: list[opencl.Argument] = [np.int32(height), np.int32(width), chunk]
         with session.job() as job:
-            arguments = [*sizes, job.read(points_uv), job.read(magnified), job.write(factor), job.write(opacity)]
+            arguments: opencl.Arguments = {
+                "height": np.int32(height),
+                "width": np.int32(width),
+                "chunk": chunk,
+                "points_uv": job.read(points_uv),
+                "magnified": job.read(magnified),
+                "factor": job.write(factor),
+                "opacity": job.write(opacity),
+            }
             limits = {name: str(getattr(constants, name)) for name in ("TORN", "SLANTED", "BENT")}
             defines = opencl.defines_for(magnified.dtype, **limits)
             job.launch("stretch.cl", "stretch", defines, (items, height, batch), arguments, (group, 1, 1))

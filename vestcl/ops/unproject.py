@@ -78,9 +78,14 @@ def _forward(session: opencl.Session, depth: np.ndarray, inverse_K: np.ndarray) 
     points_xyz = np.empty((batch, height * width, 3), depth.dtype)
     if points_xyz.size:
         chunk, items, group = work_items(session, width)
-        sizes: list[opencl.Argument] = [np.int32(height), np.int32(width), chunk]
+        sizes = {"height": np.int32(height), "width": np.int32(width), "chunk": chunk}
         with session.job() as job:
-            arguments = [*sizes, job.read(depth), job.read(inverse_K), job.write(points_xyz)]
+            arguments: opencl.Arguments = {
+                **sizes,
+                "depth": job.read(depth),
+                "inverse_K": job.read(inverse_K),
+                "points_xyz": job.write(points_xyz),
+            }
             defines = opencl.defines_for(depth.dtype)
             job.launch("unproject.cl", "unproject", defines, (items, height, batch), arguments, (group, 1, 1))
     return points_xyz
@@ -93,9 +98,14 @@ def _backward(
     grad_depth = np.empty(shape, grad_points_xyz.dtype)
     if grad_depth.size:
         chunk, items, group = work_items(session, width)
-        sizes: list[opencl.Argument] = [np.int32(height), np.int32(width), chunk]
+        sizes = {"height": np.int32(height), "width": np.int32(width), "chunk": chunk}
         with session.job() as job:
-            arguments = [*sizes, job.read(inverse_K), job.read(grad_points_xyz), job.write(grad_depth)]
+            arguments: opencl.Arguments = {
+                **sizes,
+                "inverse_K": job.read(inverse_K),
+                "grad_points_xyz": job.read(grad_points_xyz),
+                "grad_depth": job.write(grad_depth),
+            }
             defines = opencl.defines_for(grad_depth.dtype)
             job.launch("unproject.cl", "unproject_backward", defines, (items, height, batch), arguments, (group, 1, 1))
     return grad_depth

@@ -203,7 +203,10 @@ def _sections(config: OperatorsBench, _: opencl.Session, console: Console) -> It
         with console.status(operator.name), trace.stage(operator.name):
             rows += measure(operator, config.seconds, config.threads, config.reference)
     size = f"{config.height}x{config.width}, C = {config.channels}, radius {config.radius:g} px, float32"
-    notes = ("x copy: over a copy of the same bytes. kernels, around: of profiled calls.",)
+    notes = (
+        "x copy: over a copy of the same bytes. Of profiled calls, kernels ms: while a kernel runs; around ms: all "
+        "the rest, which is Python, autograd, launches, and what the device's driver copies and maps.",
+    )
     shown = ("ms (quartiles)", *(["reference ms"] if config.reference else []), "copy ms")
     plots = {
         "operators": partial(bars, columns=shown),

@@ -145,11 +145,12 @@ class _Roofs:
     def run(self) -> None:
         """Copy, and multiply and add."""
         defines = {"BUILTINS": int(self._session.compiles_builtins)}
-        numbers = [np.int32(self._rounds), np.float32(0.5), np.float32(1)]
+        numbers = {"rounds": np.int32(self._rounds), "m": np.float32(0.5), "c": np.float32(1)}
         with self._session.job() as job:
-            size = (self._blocks * self._local,)
-            job.launch(_FILE, "copy_numbers", defines, size, [self._from, self._to], (self._local,))
-            job.launch(_FILE, "multiply_add", defines, (self._items,), [*numbers, self._sums], (self._local,))
+            size, copied = (self._blocks * self._local,), {"from": self._from, "to": self._to}
+            job.launch(_FILE, "copy_numbers", defines, size, copied, (self._local,))
+            sums = numbers | {"sums": self._sums}
+            job.launch(_FILE, "multiply_add", defines, (self._items,), sums, (self._local,))
 
 
 if __name__ == "__main__":

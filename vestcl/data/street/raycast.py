@@ -3,6 +3,7 @@
 A pixel's ray is s (R K^-1) (u, v, 1), scaled so that s is its z-depth; see kernels/raycast/raycast.cl.
 """
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -181,67 +182,95 @@ def cast(
             the rest is of the ray through the pixel's centre.
     """
     height, width = frame.depth.shape[2:]
-    count = len(scene.solids)
-    assert 0 < count <= MAX_SOLIDS and scene.solids.dtype == SOLID
-    tile = constants.TILE
-    tile_rows, tile_columns = -(-height // tile), -(-width // tile)
-    cells = int(2 * SHADOW_REACH / SHADOW_CELL)
-    crossings = scene.crossings if len(scene.crossings) else np.zeros((1, 2), np.float32)
-    inputs = (_view(scene, camera_from_world, K, samples), scene.solids, crossings)
+    view = _view(scene, camera_from_world, K, samples)
     with opencl.current().job() as job:
-        view, solids, side_streets = (job.read(array) for array in inputs)
-        image_rects, shadow_cells = job.scratch(4 * count, np.int32), job.scratch(4 * count, np.int32)
-        shadow_rects = job.scratch(4 * count, np.float32)
-        tiles = [image_rects, *_lists(job, tile_rows * tile_columns, count)]
-        shadows, cell_lists = [shadow_cells, shadow_rects], _lists(job, cells * cells, count)
-        sizes = _int32(height, width, cells, cells)
-        bent = scene.course is not None
-        _launch(job, "project_solids", (count,), [*sizes, view, solids, image_rects, *shadows], bent=bent)
-        _launch(job, "list_solids", (tile_rows,), [*_int32(tile_columns, tile, count), *tiles], bent=bent)
-        _launch(job, "list_solids", (cells,), [*_int32(cells, 1, count), shadow_cells, *cell_lists], bent=bent)
-        sizes = _int32(height, width, tile_columns, count, len(scene.crossings), cells, cells)
-        wanted = _int32(samples, frame.instances is not None)
-        scenery = [view, solids, *tiles, shadow_rects, *cell_lists, side_streets]
-        arguments = [*sizes, *wanted, *scenery, *_outputs(job, frame, index)]
-        if scene.course is not None:
-            arguments += [*_int32(len(scene.course)), job.read(scene.course)]
-        _launch(job, "raycast", (tile_rows * tile_columns, tile), arguments, (1, tile), bent=bent)
+        listed = _list_solids(job, scene, job.read(view), height, width)
+        wanted = _int32(samples=samples, with_instances=frame.instances is not None)
+        tiles = [-(-height // constants.TILE) * -(-width // constants.TILE), constants.TILE]
+        arguments: opencl.Arguments = {**listed, **wanted, **_outputs(job, frame, index), **_course(job, scene)}
+        _launch(job, "raycast", tiles, arguments, bent=scene.course is not None)
 
 
-def _outputs(job: opencl.Job, frame: Frame, index: int) -> list[opencl.Argument]:
-    outputs: list[opencl.Argument] = [job.write(a[index]) for a in (frame.colour, frame.depth, frame.labels)]
-    return [*outputs, job.scratch(1, np.int32) if frame.instances is None else job.write(frame.instances[index])]
+def _list_solids(
+    job: opencl.Job, scene: Scene, view: opencl.Buffer, height: int, width: int
+) -> dict[str, opencl.Argument]:
+    """Which solids each tile of the image and each square of road has: what the kernel raycast reads."""
+    count, tile, bent = len(scene.solids), constants.TILE, scene.course is not None
+    assert 0 < count <= MAX_SOLIDS and scene.solids.dtype == SOLID
+    rows, columns, cells = -(-height // tile), -(-width // tile), int(2 * SHADOW_REACH / SHADOW_CELL)
+    crossings = scene.crossings if len(scene.crossings) else np.zeros((1, 2), np.float32)
+    image_rects, shadow_cells = job.scratch(4 * count, np.int32), job.scratch(4 * count, np.int32)
+    tile_solids, tile_counts = _lists(job, rows * columns, count)
+    cell_solids, cell_counts = _lists(job, cells * cells, count)
+    shared: dict[str, opencl.Argument] = {
+        **_int32(height=height, width=width, solid_count=count, cell_rows=cells, cell_columns=cells),
+        "view": view,
+        "solids": job.read(scene.solids),
+        "image_rects": image_rects,
+        "shadow_rects": job.scratch(4 * count, np.float32),
+    }
+    _launch(job, "project_solids", [count], {**shared, "shadow_cells": shadow_cells}, bent=bent)
+    for cell_rows, cell_columns, cell, rects, lists, counts in (
+        (rows, columns, tile, image_rects, tile_solids, tile_counts),
+        (cells, cells, 1, shadow_cells, cell_solids, cell_counts),
+    ):
+        sizes = _int32(rows=cell_rows, columns=cell_columns, cell=cell, solid_count=count)
+        listed = {"rects": rects, "cell_solids": lists, "cell_counts": counts}
+        _launch(job, "list_solids", [cell_rows], {**sizes, **listed}, bent=bent)
+    return {
+        **shared,
+        **_int32(tile_rows=rows, tile_columns=columns, crossing_count=len(scene.crossings)),
+        "tile_solids": tile_solids,
+        "tile_counts": tile_counts,
+        "cell_solids": cell_solids,
+        "cell_counts": cell_counts,
+        "crossings": job.read(crossings),
+    }
+
+
+def _course(job: opencl.Job, scene: Scene) -> dict[str, opencl.Argument]:
+    if scene.course is None:
+        return {}
+    return {**_int32(course_points=len(scene.course)), "course": job.read(scene.course)}
+
+
+def _outputs(job: opencl.Job, frame: Frame, index: int) -> dict[str, opencl.Buffer]:
+    names = [name for name in ("colour", "depth", "labels", "instances") if getattr(frame, name) is not None]
+    written = {name: job.write(getattr(frame, name)[index]) for name in names}
+    return {"instances": job.scratch(1, np.int32)} | written
 
 
 def _launch(
     job: opencl.Job,
     name: str,
-    global_size: tuple[int, ...],
-    arguments: list[opencl.Argument],
-    local_size: tuple[int, ...] | None = None,
+    global_size: list[int],
+    arguments: opencl.Arguments,
     *,
     bent: bool,
 ) -> None:
+    """A kernel for the first dimension's items; a second dimension is a tile's rows, which share a group."""
+    first, *rows = global_size
+    items, group = opencl.grouped(job.session, first, at_once=math.prod(rows))
+    job.launch("raycast/raycast.cl", name, defines(bent), (items, *rows), arguments, (group, *rows))
+
+
+def defines(bent: bool) -> opencl.Defines:
+    """What raycast.cl is built with, for a straight or a bent street."""
     names = {f"{kind.__name__.upper()}_{m.name}": int(m) for kind in (Shape, Material, Label) for m in kind}
-    defines = opencl.defines_for(
-        np.dtype(np.float32), SKY_DEPTH=f"{STREET_SKY_DEPTH}f", SHADOW_CELL=f"{SHADOW_CELL}f", **names
-    )
-    if bent:
-        defines |= {
-            "BENT": 1,
-            "COURSE_STEP": f"{COURSE_STEP}f",
-            "COARSE": _COARSE,
-            "NEWTON": _NEWTON,
-            "SMOOTH": _SMOOTH,
-        }
-    job.launch("raycast/raycast.cl", name, defines, global_size, arguments, local_size)
+    straight = opencl.defines_for(
+        np.dtype(np.float32), SKY_DEPTH=f"{STREET_SKY_DEPTH}f", SHADOW_CELL=f"{SHADOW_CELL}f", **names,
+        SOLID_BYTES=SOLID.itemsize, VIEW_BYTES=_VIEW.itemsize,
+    )  # fmt: skip
+    course: opencl.Defines = {"BENT": 1, "COURSE_BYTES": COURSE.itemsize, "COURSE_STEP": f"{COURSE_STEP}f"}
+    search: opencl.Defines = {"COARSE": _COARSE, "NEWTON": _NEWTON, "SMOOTH": _SMOOTH}
+    return {**straight, **course, **search} if bent else straight
 
 
-def _int32(*values: int) -> list[np.int32]:
-    return [np.int32(value) for value in values]
+def _int32(**values: int) -> dict[str, np.int32]:
+    return {name: np.int32(value) for name, value in values.items()}
 
 
-def _lists(job: opencl.Job, cells: int, count: int) -> tuple[opencl.Argument, opencl.Argument]:
+def _lists(job: opencl.Job, cells: int, count: int) -> tuple[opencl.Buffer, opencl.Buffer]:
     return job.scratch(cells * count, np.uint16), job.scratch(cells, np.int32)
 
 
