@@ -19,6 +19,8 @@ from vestcl.cli.main import main
 #: Commands that are not run here, and why.
 LONG: Final = {
     r"python3 -m venv|source |pip install|make venv": "an installation: .ci/run and tests/test_packaging.py",
+    r"make gpu-check": "minutes, and a GPU; tests/opencl/test_gpu_check.py",
+    r"export ": "of the shell, for the command after it",
     r"make (demo|test|tables)": "minutes; tests/cli/test_demo.py and tests/test_docs_tables.py run them small",
     r"vestcl view": "serves until Ctrl-C; tests/viewer and tests/cli/test_view_command.py",
     r"vestcl bench": "minutes to hours; tests/bench",

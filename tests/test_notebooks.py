@@ -14,6 +14,7 @@ SHORTER = {
         "steps: 60": "steps: 10",
         "warm_up: 20": "warm_up: 4",
         "checkpoint_every: 60": "checkpoint_every: 10",
+        "(2010, 2011, 2012, 2013)": "(2010,)",
     }
 }
 
