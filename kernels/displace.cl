@@ -1,15 +1,18 @@
 // Forward 3D displacement and projection into a camera.
 //
-//   (a, b, c, z) = M (x + u, 1),  uv = (a / c, b / c)
+//   (a, b, c, z) = M ((x - o) + u, 1),  uv = (a / c, b / c)
 //
-// with M [4, 4] from the host: rows 0 to 2 are K [R|t] of the target camera, row 3 is the z-row of [R|t].
+// with M [4, 4] from the host: rows 0 to 2 are K [R|R o + t] of the target camera, row 3 is the z-row of [R|R o + t]. o
+// is where that camera is in the source frame, so that nothing cancels, however far from the origin both are.
 // Parallel over images and chunks of points: work-item (i, b) owns points [i * chunk, (i + 1) * chunk) of image b.
 #include "common.h"
 
 typedef struct { REAL a, b, c, z; } view_t;
 
 inline view_t viewed(global const REAL* m, global const REAL* point, global const REAL* displacement) {
-  const REAL x = point[0] + displacement[0], y = point[1] + displacement[1], z = point[2] + displacement[2];
+  const REAL x = point[0] - m[16] + displacement[0];
+  const REAL y = point[1] - m[17] + displacement[1];
+  const REAL z = point[2] - m[18] + displacement[2];
   const view_t view = {
       m[0] * x + m[1] * y + m[2] * z + m[3],
       m[4] * x + m[5] * y + m[6] * z + m[7],
@@ -22,12 +25,12 @@ kernel void displace(
     const int count, const int chunk,
     global const REAL* restrict points_xyz,        // [B, N, 3]
     global const REAL* restrict displacement_xyz,  // [B, N, 3]
-    global const REAL* restrict projection,        // [B, 4, 4]
+    global const REAL* restrict projection,        // [B, 5, 4]: M, then o and 0
     global REAL* restrict points_uv,               // [B, N, 2] out
     global REAL* restrict z)                       // [B, N] out
 {
   const int begin = get_global_id(0) * chunk, end = min(begin + chunk, count), b = get_global_id(1);
-  global const REAL* m = projection + (size_t)b * 16;
+  global const REAL* m = projection + (size_t)b * 20;
   for (int i = begin; i < end; i++) {
     const size_t at = (size_t)b * count + i;
     const view_t view = viewed(m, points_xyz + at * 3, displacement_xyz + at * 3);
@@ -44,13 +47,13 @@ kernel void displace_backward(
     const int count, const int chunk,
     global const REAL* restrict points_xyz,        // [B, N, 3]
     global const REAL* restrict displacement_xyz,  // [B, N, 3]
-    global const REAL* restrict projection,        // [B, 4, 4]
+    global const REAL* restrict projection,        // [B, 5, 4]: M, then o and 0
     global const REAL* restrict grad_points_uv,    // [B, N, 2]
     global const REAL* restrict grad_z,            // [B, N]
     global REAL* restrict grad_xyz)                // [B, N, 3] out
 {
   const int begin = get_global_id(0) * chunk, end = min(begin + chunk, count), b = get_global_id(1);
-  global const REAL* m = projection + (size_t)b * 16;
+  global const REAL* m = projection + (size_t)b * 20;
   for (int i = begin; i < end; i++) {
     const size_t at = (size_t)b * count + i;
     const view_t view = viewed(m, points_xyz + at * 3, displacement_xyz + at * 3);

@@ -110,6 +110,30 @@ def test_moving_the_camera_is_moving_the_points(session: opencl.Session, float64
         assert_close(moved_camera, moved_points)
 
 
+@pytest.mark.parametrize("kilometres", [0.0, 1, 10])
+def test_far_from_the_origin_it_is_as_exact(mapped_session: opencl.Session, kilometres: float) -> None:
+    """A camera and its points, both that far away: float32 is off by the rounding of uv only, not by 0.1 px."""
+    given = {name: value.detach() for name, value in scene(2, 500, torch.float32).items()}
+    away = torch.tensor([700.0, 40, -710]) * kilometres
+    given["points_xyz"] = given["points_xyz"] + away
+    given["tgt_from_src"][:, :3, 3] -= given["tgt_from_src"][:, :3, :3] @ away
+    points_uv, z = displace(**given)
+    wanted_uv, wanted_z = reference.displace(**{name: value.double() for name, value in given.items()})
+    torch.testing.assert_close(points_uv.double(), wanted_uv, rtol=2e-6, atol=1e-4)
+    torch.testing.assert_close(z.double(), wanted_z, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "rows", [torch.zeros(3, 4), torch.cat([1e-30 * torch.eye(3), torch.full((3, 1), 1e15)], dim=1)]
+)
+def test_a_motion_that_can_not_be_undone(session: opencl.Session, rows: torch.Tensor) -> None:
+    given = {name: value.detach() for name, value in scene(1, 4, torch.float32).items()}
+    given["tgt_from_src"][0, :3] = rows
+    wanted_uv, wanted_z = reference.displace(**given)
+    points_uv, z = displace(**given)
+    assert torch.equal(points_uv.isfinite(), wanted_uv.isfinite()) and torch.equal(z.isfinite(), wanted_z.isfinite())
+
+
 def test_behind_the_camera_is_projected_through_it(session: opencl.Session, dtype: torch.dtype) -> None:
     arguments = scene(1, 50, dtype)
     with torch.no_grad():

@@ -79,17 +79,35 @@ def _formula(
     projection: torch.Tensor, points_xyz: torch.Tensor, displacement_xyz: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The kernel's formula in plain torch, for the derivatives of its gradients."""
-    moved_xyz = points_xyz + displacement_xyz
-    a, b, c, z = (moved_xyz @ projection[..., :3].mT + projection[:, None, :, 3]).unbind(-1)
+    moved_xyz = points_xyz - projection[:, 4:, :3] + displacement_xyz
+    a, b, c, z = (moved_xyz @ projection[:, :4, :3].mT + projection[:, None, :4, 3]).unbind(-1)
     finite = (a / c).isfinite() & (b / c).isfinite()
     safe = torch.where(finite, c, 1)
     return torch.stack([torch.where(finite, x / safe, torch.nan) for x in (a, b)], dim=-1), z
 
 
 def _projection(K: np.ndarray, tgt_from_src: np.ndarray | None) -> np.ndarray:
-    """[B, 4, 4]: K [R|t] and below it the z-row of [R|t], computed in float64 and rounded once."""
+    """[B, 5, 4]: K [R|R o + t], the z-row of [R|R o + t], and (o, 0), where o is the target camera in the source frame.
+
+    Computed in float64 and rounded once; R o + t is what remains of o's own rounding.
+    """
     rigid = np.eye(3, 4)[None].repeat(len(K), 0) if tgt_from_src is None else tgt_from_src[:, :3].astype(np.float64)
-    return np.concatenate([K.astype(np.float64) @ rigid, rigid[:, 2:]], axis=1).astype(K.dtype)
+    seen_from = np.zeros((len(K), 1, 4), K.dtype)
+    if tgt_from_src is not None:
+        seen_from[:, 0, :3] = _origin(rigid, K.dtype)
+        rigid[..., 3] += (rigid[..., :3] @ seen_from[:, 0, :3, None].astype(np.float64))[..., 0]
+    rows = np.concatenate([K.astype(np.float64) @ rigid, rigid[:, 2:]], axis=1).astype(K.dtype)
+    return np.concatenate([rows, seen_from], axis=1)
+
+
+def _origin(rigid: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """o [B, 3] with R o + t = 0 for [R|t] [B, 3, 4], rounded; 0 where there is none, or it is not finite."""
+    with np.errstate(all="ignore"):
+        try:
+            found = (-np.linalg.solve(rigid[..., :3], rigid[..., 3:])[..., 0]).astype(dtype)
+        except np.linalg.LinAlgError:
+            return np.zeros((len(rigid), 3), dtype)
+    return np.where(np.isfinite(found).all(axis=1, keepdims=True), found, dtype.type(0))
 
 
 def _forward(
