@@ -110,9 +110,9 @@ def forecast_frames(
         raise ValueError(f"`steps` and `views` must be 1 or more, got {steps} and {len(views)}")
     if learned not in get_args(Learned):
         raise ValueError(f'`learned` must be "tested" or "all", got {learned!r}')
-    views = [working_view(perception, view) for view in views]
     if _is_composed(model.config, mode, learned):
         return at_recorded_size(_composed(perception, model, index, steps, views, report), perception)
+    views = [working_view(perception, view) for view in views]
     given, note = _given(perception, index, model.config, steps)
     report("network")
     start = time.perf_counter()
@@ -166,7 +166,8 @@ def _composed(
         frames = geometric.frames
         if REFINEMENT in parts and parts[REFINEMENT].used:
             with clock:
-                frames = refined(perception, model, index, motion, views, frames)
+                shown = [working_view(perception, view) for view in views]
+                frames = refined(perception, model, index, motion, shown, frames)
     stages = watch.take()
     whole = max(clock.seconds, sum(stages.values()))  # another thread's perception is not in the networks' time
     profile = with_rest(stages, whole)
