@@ -4,7 +4,7 @@ import ast
 import functools
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -36,8 +36,13 @@ def module_of(file: Path) -> str:
 MODULES = {module_of(file): file for file in SOURCES}
 
 
-def imports(file: Path) -> Iterator[str]:
+@functools.cache
+def imports(file: Path) -> tuple[str, ...]:
     """Every name that ``file`` imports, anywhere in it: modules, and what is taken from them as module.name."""
+    return tuple(_imports(file))
+
+
+def _imports(file: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -83,12 +88,22 @@ def folder(module: str) -> str:
     return module.split(".")[1] if module.startswith("vestcl.") else ""
 
 
-@pytest.mark.parametrize("file", LIBRARY, ids=identify)
-def test_packages_import_downwards(file: Path) -> None:
-    own = folder(module_of(file))
-    if own:  # the package itself has lazy names only
+def faults(files: Iterable[Path], found: Callable[[Path], Iterable[str]]) -> dict[str, list[str]]:
+    """By file, what ``found`` finds in it; files without are left out."""
+    by_file = {identify(file): sorted(found(file)) for file in files}
+    assert by_file
+    return {file: names for file, names in by_file.items() if names}
+
+
+def test_packages_import_downwards() -> None:
+    def upwards(file: Path) -> set[str]:
+        own = folder(module_of(file))
+        if not own:  # the package itself has lazy names only
+            return set()
         taken = {folder(module) for module in graph()[module_of(file)]} - {""}
-        assert not {name for name in taken if LEVELS[name] > LEVELS[own]}
+        return {name for name in taken if LEVELS[name] > LEVELS[own]}
+
+    assert faults(LIBRARY, upwards) == {}
 
 
 def test_every_package_has_a_level() -> None:
@@ -104,10 +119,12 @@ def hidden_from(module: str, name: str) -> bool:
     return False
 
 
-@pytest.mark.parametrize("file", SOURCES, ids=identify)
-def test_nothing_private_is_imported_from_elsewhere(file: Path) -> None:
-    ours = [name for name in imports(file) if is_in(name, "vestcl", "train")]
-    assert not [name for name in ours if hidden_from(module_of(file), name)]
+def test_nothing_private_is_imported_from_elsewhere() -> None:
+    def private(file: Path) -> list[str]:
+        ours = [name for name in imports(file) if is_in(name, "vestcl", "train")]
+        return [name for name in ours if hidden_from(module_of(file), name)]
+
+    assert faults(SOURCES, private) == {}
 
 
 @pytest.mark.parametrize(
@@ -124,28 +141,28 @@ def test_what_counts_as_private(module: str, name: str, hidden: bool) -> None:
     assert hidden_from(module, name) is hidden
 
 
-@pytest.mark.parametrize("file", SOURCES, ids=identify)
-def test_only_the_runtime_imports_pyopencl(file: Path) -> None:
-    if not identify(file).startswith("vestcl/opencl/"):
-        assert not [module for module in imports(file) if is_in(module, "pyopencl")]
+def test_only_the_runtime_imports_pyopencl() -> None:
+    elsewhere = [file for file in SOURCES if not identify(file).startswith("vestcl/opencl/")]
+    assert faults(elsewhere, lambda file: [module for module in imports(file) if is_in(module, "pyopencl")]) == {}
 
 
-@pytest.mark.parametrize("file", LIBRARY, ids=identify)
-def test_the_library_does_not_import_training(file: Path) -> None:
-    assert not [module for module in imports(file) if is_in(module, "train", "tests")]
+def test_the_library_does_not_import_training() -> None:
+    assert faults(LIBRARY, lambda file: [module for module in imports(file) if is_in(module, "train", "tests")]) == {}
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "vestcl" / "reference").rglob("*.py")), ids=identify)
-def test_the_reference_imports_geometry_only(file: Path) -> None:
+def test_the_reference_imports_geometry_only() -> None:
     allowed = ("torch", "vestcl.geometry", "vestcl.constants", "vestcl.reference", *sys.stdlib_module_names)
-    assert not [module for module in imports(file) if not is_in(module, *allowed)]
+    files = (ROOT / "vestcl" / "reference").rglob("*.py")
+    assert faults(files, lambda file: [module for module in imports(file) if not is_in(module, *allowed)]) == {}
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "vestcl" / "ops").rglob("*.py")), ids=identify)
-def test_operators_depend_on_the_runtime(file: Path) -> None:
+def test_operators_depend_on_the_runtime() -> None:
     below = ("vestcl.constants", "vestcl.geometry", "vestcl.ops", "vestcl.opencl")
-    ours = {module for module in imports(file) if is_in(module, "vestcl")}
-    assert not {module for module in ours if not is_in(module, *below)}
+
+    def others(file: Path) -> set[str]:
+        return {module for module in imports(file) if is_in(module, "vestcl") and not is_in(module, *below)}
+
+    assert faults((ROOT / "vestcl" / "ops").rglob("*.py"), others) == {}
 
 
 def test_importing_vestcl_loads_no_driver() -> None:
