@@ -1,5 +1,7 @@
 """vestcl.forecasting.geometric.render: planes on new views, by hand."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -55,6 +57,21 @@ def test_colour_is_divided_by_coverage(zoom: float) -> None:
     there = ~holes(shown)[0]
     assert there.mean() > 0.6
     np.testing.assert_allclose(shown.planes[:3, there], colour((0.2, 0.5, 0.9))[:, there], atol=1e-5)
+
+
+@pytest.mark.parametrize("zoom", [0.4, 1.0, 3.2, 6.0])
+def test_a_camera_with_another_focal_length_sees_the_same_wall(zoom: float) -> None:
+    image = noise(blur=2.0)
+    cloud = dataclasses.replace(cloud_of(image, flat(10)), focal=K[0, 0])
+    zoomed = np.diag([zoom, zoom, 1]) @ K
+    zoomed[:2, 2] = K[:2, 2]
+    shown = show([cloud], zoomed, EYE, HEIGHT, WIDTH)
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    at = np.stack([(x - K[0, 2]) * (1 / zoom - 1), (y - K[1, 2]) * (1 / zoom - 1)])
+    warped = backward_warp(torch.from_numpy(image)[None], torch.from_numpy(at)[None].float())[0].numpy()
+    there = (np.abs(x - K[0, 2]) < 0.9 * zoom * WIDTH / 2) & (np.abs(y - K[1, 2]) < 0.9 * zoom * HEIGHT / 2)
+    assert shown.coverage[0][there].min() > 0.7
+    assert decibels(shown.planes[:3, there], warped[:, there]) > 30
 
 
 def test_inverse_depth_and_motion() -> None:

@@ -125,17 +125,17 @@ def _true_clouds(cur: Sample, after: Sample) -> list[FrameCloud]:
     hidden = ~background(cur.read_labels())[0]
     moved = _rigid(cur, after, background_points, behind.labels[0] == SKY)
     return [
-        _cloud(cur.read_image(), points, points + _motion(cur, after), np.ones_like(hidden)),
-        _cloud(behind.colour[0], background_points, moved, hidden),
+        _cloud(cur.read_image(), points, points + _motion(cur, after), np.ones_like(hidden), cur.K),
+        _cloud(behind.colour[0], background_points, moved, hidden, cur.K),
     ]
 
 
-def _cloud(colour: NDArray[np.float32], points: Array, moved: Array, which: NDArray[np.bool_]) -> FrameCloud:
-    """The pixels of ``which`` [H, W]."""
+def _cloud(colour: NDArray[np.float32], points: Array, moved: Array, which: NDArray[np.bool_], K: Array) -> FrameCloud:
+    """The pixels of ``which`` [H, W]; ``K`` is that of ``colour``."""
     rows, columns = np.nonzero(which)
     there, came = (each[:, rows, columns].T.astype(np.float32) for each in (moved, moved - points))
     z_src = points[2, rows, columns].astype(np.float32)
-    return FrameCloud(there, z_src, colour, came, rows, columns)
+    return FrameCloud(there, z_src, colour, came, rows, columns, focal=float(K[0, 0]))
 
 
 def _motion(cur: Sample, after: Sample) -> NDArray[np.float32]:

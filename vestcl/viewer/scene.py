@@ -161,6 +161,7 @@ def _thinned(cloud: FrameCloud, stride: int) -> FrameCloud:
         cloud.step_xyz[kept],
         cloud.rows[kept] // stride,
         cloud.columns[kept] // stride,
+        focal=None if cloud.focal is None else cloud.focal / stride,
     )
 
 

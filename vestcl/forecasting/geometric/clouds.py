@@ -46,7 +46,7 @@ def frame_clouds(
     before = _cloud(curve(prev.image), scale * prev.depth, ~prev.own, K, velocity, *since, full)
     hidden = ~cur.layers.mask & ~cur.own
     behind = _cloud(cur.layers.background_image, cur.layers.background_depth, hidden, K)
-    return [shown, before, *([] if memory is None else [_static(memory)]), behind]
+    return [shown, before, *([] if memory is None else [_static(memory, K)]), behind]
 
 
 def _shown(paths: Paths, own: NDArray[np.bool_], full: NDArray[np.float32] | None) -> MovingCloud:
@@ -59,7 +59,7 @@ def _shown(paths: Paths, own: NDArray[np.bool_], full: NDArray[np.float32] | Non
         points = np.where(own, now, paths.at(step, future_from_cur))
         return np.asarray(cv2.transpose(points.astype(np.float32).reshape(3, -1)))
 
-    return _moving(moved, z_src, frame.image, rows, columns, full)
+    return _moving(moved, z_src, frame.image, rows, columns, frame.K, full)
 
 
 def _cloud(
@@ -84,13 +84,13 @@ def _cloud(
         points = _transform(cur_from_src, points + elapsed * speed)
         speed = speed @ cur_from_src[:3, :3].T
     z_src = z.astype(np.float32)
-    return _moving(lambda k, camera: _transform(camera, points + k * speed), z_src, image, y, x, full)
+    return _moving(lambda k, camera: _transform(camera, points + k * speed), z_src, image, y, x, K, full)
 
 
-def _static(memory: SceneMemory) -> MovingCloud:
+def _static(memory: SceneMemory, K: NDArray[np.float64]) -> MovingCloud:
     """What is remembered, at rest in the world."""
     pixels = memory.rows, memory.columns
-    return _moving(lambda k, camera: _transform(camera, memory.points_xyz), memory.z_src, memory.image, *pixels)
+    return _moving(lambda k, camera: _transform(camera, memory.points_xyz), memory.z_src, memory.image, *pixels, K)
 
 
 def _moving(
@@ -99,9 +99,13 @@ def _moving(
     image: NDArray[np.float32],
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],
+    K: NDArray[np.float64],
     full: NDArray[np.float32] | None = None,
 ) -> MovingCloud:
-    """A cloud whose points [N, 3] are ``moved(step, future_from_cur)``: a step's are the next one's points before."""
+    """A cloud whose points [N, 3] are ``moved(step, future_from_cur)``: a step's are the next one's points before.
+
+    ``K`` is that of ``image``.
+    """
     kept: dict[float, NDArray[np.floating]] = {}
 
     def points_at(step: float, future_from_cur: NDArray[np.float64]) -> NDArray[np.floating]:
@@ -114,7 +118,7 @@ def _moving(
     def at(step: float, camera: Cameras) -> FrameCloud:
         there, before = (points_at(k, camera(k)) for k in (step, step - 1))
         step_xyz = (there - before).astype(np.float32)
-        return FrameCloud(there.astype(np.float32), z_src, image, step_xyz, rows, columns, full)
+        return FrameCloud(there.astype(np.float32), z_src, image, step_xyz, rows, columns, full, float(K[0, 0]))
 
     return at
 

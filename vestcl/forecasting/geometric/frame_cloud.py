@@ -27,6 +27,8 @@ class FrameCloud:
     """[N] ... and its column."""
     full: NDArray[np.float32] | None = None
     """[3, H', W'], the image as it was recorded, where it is larger than ``image``."""
+    focal: float | None = None
+    """Px, fx of ``image``; None is that of the view."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -147,12 +147,13 @@ def _splat(
     if wanted.covered is not None:
         kept = _near(cloud, points_uv[0], wanted.covered, wanted)
         cloud, points_uv, z = _some(cloud, kept), points_uv[:, kept], z[:, kept]
-    zoom, uv = cloud.z_src / np.maximum(z[0], np.float32(1e-3)), transposed(points_uv[0])
+    magnified = np.float32(1.0 if cloud.focal is None else K[0, 0] / cloud.focal)
+    zoom, uv = magnified * cloud.z_src / np.maximum(z[0], np.float32(1e-3)), transposed(points_uv[0])
     whole, stretch = surface(CloudPixels.of(cloud), uv, zoom)
     radii = np.clip(RHO * stretch, *RADIUS_LIMITS)[None]
     opacities = (whole & (RHO * zoom <= RADIUS_LIMITS[1]))[None].astype(np.float32)
     size = wanted.height, wanted.width
-    image, coverage = splat(points_uv, z, radii, opacities, _features(cloud, uv, z[0], whole)[None], *size)
+    image, coverage = splat(points_uv, z, radii, opacities, _features(cloud, uv, z[0], zoom, whole)[None], *size)
     composite, covered, pixels = image[0].transpose(1, 2, 0).reshape(-1, 16), coverage.ravel(), wanted.of_view()
     mean = transposed(composite if pixels is None else composite[pixels])
     mean /= np.maximum(covered if pixels is None else covered[pixels], np.float32(1e-6))
@@ -162,7 +163,11 @@ def _splat(
 
 
 def _features(
-    cloud: FrameCloud, uv: NDArray[np.float32], z: NDArray[np.float32], whole: NDArray[np.bool_]
+    cloud: FrameCloud,
+    uv: NDArray[np.float32],
+    z: NDArray[np.float32],
+    zoom: NDArray[np.float32],
+    whole: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
     """[N, 16]: colour 3, inverse depth, motion 3, and what `origins` finds of points at ``uv`` [2, N], ``z`` [N]."""
     pixels, distance = CloudPixels.of(cloud), np.maximum(z, np.float32(1e-3), dtype=np.float32)
@@ -170,7 +175,7 @@ def _features(
     features[:3] = pixels.colours(cloud.image)
     np.divide(1, distance, out=features[3])
     features[4:7] = transposed(cloud.step_xyz)
-    origins(cloud, pixels, uv, np.divide(cloud.z_src, distance, dtype=np.float32), whole, features[7:])
+    origins(cloud, pixels, uv, zoom, whole, features[7:])
     return transposed(features)
 
 
@@ -196,7 +201,7 @@ def _near(
 def _some(cloud: FrameCloud, kept: NDArray[np.bool_]) -> FrameCloud:
     """The points of ``kept`` [N]."""
     moving = cloud.points_xyz[kept], cloud.z_src[kept], cloud.image, cloud.step_xyz[kept]
-    return FrameCloud(*moving, cloud.rows[kept], cloud.columns[kept])
+    return FrameCloud(*moving, cloud.rows[kept], cloud.columns[kept], focal=cloud.focal)
 
 
 def _seen_at(
