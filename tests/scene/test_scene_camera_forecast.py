@@ -25,6 +25,28 @@ def test_a_filter_is_the_scalar_kalman_filter_worked_out_by_hand() -> None:
     assert bank.forecast([1.0, 3.0])[:, 0] == pytest.approx([2.0, 6.0])  # the mean of (0, 3, 3)
 
 
+def test_a_long_gap_leaves_a_filter_as_it_was_before_anything_was_measured() -> None:
+    """After 1,000 correlation times of a stationary rate nothing of the measurement is left."""
+    fresh, bank = (Bank([joined(oscillator(1.0, 0.5, 1.0), decaying_rate(2.0, 1.0), noise=0.1)]) for _ in range(2))
+    bank.measure(np.array([3.0]), 0.1)
+    bank.measure(np.array([0.0]), 2000.0)
+    for each in (fresh, bank):
+        each.measure(np.array([0.4]), 0.1)
+    assert bank.forecast([0.1, 0.2]) == pytest.approx(fresh.forecast([0.1, 0.2]), rel=1e-2)
+    assert bank.weights.tolist() == [[1.0]]
+
+
+def test_intervals_add_up() -> None:
+    """An unmeasured gap of 8 s is 80 of 0.1 s."""
+    once, often = (Bank([joined(oscillator(0.3, 0.2, 1.0), noise=0.1)]) for _ in range(2))
+    for bank, parts in ((once, 1), (often, 80)):
+        bank.measure(np.array([0.3]), 0.1)
+        for _ in range(parts):
+            bank.measure(None, 8.0 / parts)
+        bank.measure(np.array([0.2]), 0.1)
+    assert once.forecast([0.1, 1.0]) == pytest.approx(often.forecast([0.1, 1.0]), rel=1e-6)
+
+
 def test_the_model_that_forecasts_better_outweighs_the_other() -> None:
     bank = Bank([joined(decaying_rate(1.0, rms), noise=0.01) for rms in (0.01, 1.0)])
     rng = np.random.default_rng(0)

@@ -10,6 +10,7 @@ Computing integrals involving the matrix exponential, 1978 (the discretisation).
 """
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -25,6 +26,9 @@ MEMORY: Final = 2.0
 
 #: Decimals that intervals, seconds, are rounded to, so that the same one is discretised once.
 _MICROSECONDS: Final = 6
+
+#: Seconds that are integrated at once.
+_LONGEST: Final = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +147,12 @@ class Bank:
 
 @functools.lru_cache(maxsize=256)
 def _transition(models: tuple[Model, ...], seconds: float) -> tuple[Array, Array]:
-    """F and the noise's covariance over an interval, [M, n, n] each, by Van Loan's block exponential."""
+    """F and the noise's covariance over an interval, [M, n, n] each, by Van Loan's block exponential.
+
+    That has exp(-drift t) as well, which is beyond float64 after a long gap: intervals above `_LONGEST` are doubled,
+    F(2t) = F(t)^2, Q(2t) = F(t) Q(t) F(t)^T + Q(t).
+    """
+    doubled = math.ceil(math.log2(seconds / _LONGEST)) if seconds > _LONGEST else 0
     size = max(len(model.drift) for model in models) + 1
     steps, noises = np.zeros((2, len(models), size, size))
     for index, model in enumerate(models):
@@ -151,9 +160,11 @@ def _transition(models: tuple[Model, ...], seconds: float) -> tuple[Array, Array
         drift, density = np.zeros((2, states + 1, states + 1))
         drift[:states, :states], drift[states, :states] = model.drift, model.rate
         density[:states, :states] = model.density
-        grown = expm(np.block([[-drift, density], [np.zeros_like(drift), drift.T]]) * seconds)
+        grown = expm(np.block([[-drift, density], [np.zeros_like(drift), drift.T]]) * (seconds / 2**doubled))
         step = grown[states + 1 :, states + 1 :].T
         noise = step @ grown[: states + 1, states + 1 :]
+        for _ in range(doubled):
+            step, noise = step @ step, step @ noise @ step.T + noise
         step[:, states] = 0  # each interval's increment counts from 0
         place = np.ix_([*range(states), size - 1], [*range(states), size - 1])
         steps[index][place], noises[index][place] = step, noise
