@@ -88,11 +88,32 @@ def test_malformed_cameras(cameras: str, words: str, tmp_path: Path) -> None:
         ("1 1 0 0 0 0 0 0 1 c.png", "there is no image c.png; it looked in"),
         (f"{IMAGE}\n\n2 1 0 0 0 0 0 0 1 c.png", "line 3: there is no image"),
         (f"{IMAGE}\n\n{IMAGE}", "frames must have different names"),
+        (f"{IMAGE}\n2 1 0 0 0 0 0 0 1 b.png", "line 2 must be the points X Y POINT3D_ID of the image before, or empty"),
+        (f"{IMAGE}\n1.5 2.5 -1 7", "images.txt has two lines per image"),
+        (f"{IMAGE}\n1.5 2.5 x", "line 2 must be the points"),
+        (IMAGE.replace("1 0 0", "1_0 0 0", 1), "must have a number in place of '1_0'"),
+        (IMAGE.replace("1 0 0", "\u0661 0 0", 1), "must have a number in place of '\u0661'"),
     ],
 )
 def test_malformed_images(images: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=re.escape(words)):
         open_sequence(model_of(tmp_path, images=images))
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_ends_of_lines_and_names_with_other_ones(end: str, tmp_path: Path) -> None:
+    lines = [IMAGE, "1.5 2.5 -1 3e0 4 12", "2 1 0 0 0 0 0 0 1 a\u2028b.png", ""]
+    folder = model_of(tmp_path)
+    (folder / "images.txt").write_bytes(end.join(lines).encode("utf-8-sig"))
+    write_images(folder / "images", ["a\u2028b.png"])
+    assert [sample.name for sample in open_sequence(folder)] == ["a", "a\u2028b"]
+
+
+@pytest.mark.parametrize("missing", ["images.txt", "cameras.txt"])
+def test_one_text_file_is_missing(missing: str, street: Clip, tmp_path: Path) -> None:
+    (write_colmap(tmp_path / "scene", street, where="sparse/0") / missing).unlink()
+    with pytest.raises(ValueError, match=missing):
+        open_sequence(tmp_path / "scene")
 
 
 def test_cameras_of_two_sizes(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ integers. Lines that begin with # are comments.
 """
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -22,6 +23,7 @@ from vestcl.io.atomic import read_bytes
 
 CAMERAS: Final = "cameras.txt"
 IMAGES: Final = "images.txt"
+BINARY: Final = "images.bin"
 
 #: Where the model is looked for in a project's folder.
 _MODELS: Final = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap")
@@ -39,9 +41,15 @@ PARAMETERS: Final[Mapping[str, int]] = {
     "OPENCV_FISHEYE": 8,
 }
 
+#: The last point of a line: -1 is a point that no other image shows.
+_POINT: Final = re.compile(r"\S*\d\S* \S*\d\S* (-1|\d+)")
+
 #: Models of one focal length.
 _ONE_FOCAL: Final = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE: Final = "OPENCV_FISHEYE"
+
+#: Other characters that end a line in Python may be part of a name.
+_LINE_END: Final = re.compile(r"\r\n|\r|\n")
 
 #: Bytes of the largest text file that is read.
 _LARGEST: Final = 1 << 30
@@ -54,12 +62,14 @@ class _Camera(NamedTuple):
 
 
 def model_folder(path: Path) -> Path | None:
-    """The folder of the text files in ``path``, or of a binary model; None where there is neither."""
+    """The folder of the text files in ``path``, or of a binary model, or of one text file; None where is none."""
     if not path.is_dir():
         return None
     folders = [path / name for name in _MODELS]
     text = next((folder for folder in folders if (folder / IMAGES).exists() and (folder / CAMERAS).exists()), None)
-    return text or next((folder for folder in folders if (folder / "images.bin").exists()), None)
+    binary = next((folder for folder in folders if (folder / BINARY).exists()), None)
+    part = (folder for folder in folders[1:] if (folder / IMAGES).exists() or (folder / CAMERAS).exists())
+    return text or binary or next(part, None)
 
 
 def open_colmap(path: str | Path, fps: float | None = None, scale: float = 1.0) -> Clip:
@@ -80,7 +90,7 @@ def open_colmap(path: str | Path, fps: float | None = None, scale: float = 1.0) 
     project, folder = Path(path), model_folder(Path(path))
     if folder is None:
         raise ValueError(f"{path}: has no {CAMERAS} and {IMAGES}, neither there nor in sparse/0 or sparse")
-    if not (folder / IMAGES).exists():
+    if not (folder / IMAGES).exists() and (folder / BINARY).exists():
         convert = f"colmap model_converter --input_path {folder} --output_path {folder} --output_type TXT"
         raise ValueError(f"{folder}: has COLMAP's binary model; write the text files: {convert}")
     cameras, posed = _cameras(folder / CAMERAS), list(_images(folder / IMAGES))
@@ -103,7 +113,7 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
         text = read_bytes(path, _LARGEST).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is not text") from error
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(_LINE_END.split(text), start=1):
         if not line.lstrip().startswith("#"):
             yield f"{path}: line {number}", line.strip()
 
@@ -157,7 +167,17 @@ def _images(path: Path) -> Iterator[tuple[str, str, int, Matrix]]:
         if "\0" in words[9]:
             raise ValueError(f"{where}: NAME must be the path of an image, got {words[9][:60]!r}")
         yield where, words[9], _whole(words[8], where), calibration.invert(cam_from_world)
-        next(lines, None)
+        _check_points(*next(lines, ("", "")))
+
+
+def _check_points(where: str, line: str) -> None:
+    """Refuse what is no line of points: else a file without these lines would lose every second image."""
+    words = line.split()
+    if len(words) % 3 or (words and not _POINT.fullmatch(" ".join(words[-3:]))):
+        raise ValueError(
+            f"{where} must be the points X Y POINT3D_ID of the image before, or empty, got {line[:60]!r}; "
+            f"{IMAGES} has two lines per image"
+        )
 
 
 def _image_folder(model: Path, name: str) -> Path:
@@ -178,6 +198,8 @@ def _whole(word: str, where: str) -> int:
 
 
 def _numbers(words: list[str], where: str) -> list[float]:
+    if wrong := [word for word in words if "_" in word or not word.isascii()]:
+        raise ValueError(f"{where}: must have a number in place of {wrong[0][:40]!r}")
     try:
         numbers = [float(word) for word in words]
     except ValueError as error:

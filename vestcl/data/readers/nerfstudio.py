@@ -152,7 +152,7 @@ def _focal(entries: Mapping[str, Any], axis: str, side: int, where: str) -> floa
 
 
 def _distortion(entries: Mapping[str, Any], where: str) -> Distortion | None:
-    model = entries.get("camera_model") or _DEFAULT
+    model = _DEFAULT if entries.get("camera_model") is None else entries["camera_model"]
     if not isinstance(model, str) or model not in MODELS:
         raise ValueError(f"{where}: `camera_model` must be one of {', '.join(MODELS)}, got {_text(model)}")
     values = {key: _number(entries, key, where) or 0.0 for key in _COEFFICIENTS}
