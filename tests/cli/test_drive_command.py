@@ -13,6 +13,7 @@ from vestcl.cli import drive
 from vestcl.cli import main as cli
 from vestcl.forecasting.files import read_forecast
 from vestcl.forecasting.result import Forecast, Rendered, View
+from vestcl.io.images import write_pixels
 from vestcl.io.video.reading import Video
 from vestcl.scene.perception import Perception
 
@@ -94,6 +95,62 @@ def test_a_changed_request_is_refused(tmp_path: Path, repeater: Repeater, capsys
     (folder / "image" / "0005.png").unlink()
     assert cli.main([*arguments, "1"]) == 2
     assert "clips" in capsys.readouterr().err
+
+
+def test_the_same_request_in_other_words_continues(
+    tmp_path: Path, repeater: Repeater, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also from another folder; there a clip of the same name is another one."""
+    folder, out = write_clip(tmp_path / "clip"), str(tmp_path / "out")
+    options = ["--every", "1", "--frame", "1", "--steps", "1", "--out", out]
+    assert cli.main(["forecast", str(folder), *options]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["forecast", "clip", *options, "--view", "source"]) == 0
+    assert len(repeater.calls) == 4
+    write_clip(tmp_path / "other" / "clip")
+    monkeypatch.chdir(tmp_path / "other")
+    assert cli.main(["forecast", "clip", *options]) == 2
+    assert "holds a drive with clips" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("content", [b"a,b\n", b"\xff", b"clip,1,0001,0.0,source,forecast,x,12", b"\0"])
+def test_a_frame_with_damaged_lines_is_forecast_again(content: bytes, tmp_path: Path, repeater: Repeater) -> None:
+    folder, out = write_clip(tmp_path / "clip"), tmp_path / "out"
+    arguments = ["forecast", str(folder), "--every", "1", "--frame", "1", "--steps", "1", "--out", str(out)]
+    assert cli.main(arguments) == 0
+    kept, whole = out / "frames" / "001_clip" / "000002.csv", (out / "scores.csv").read_bytes()
+    kept.write_bytes(content)
+    assert cli.main(arguments) == 0
+    assert [index for _, index, _ in repeater.calls] == [1, 2, 3, 4, 2]
+    assert (out / "scores.csv").read_bytes() == whole
+
+
+@pytest.mark.parametrize("picture", [b"", np.zeros((9, 9, 3), np.uint8)])
+def test_a_damaged_image_is_named(
+    picture: bytes | np.ndarray, tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = write_clip(tmp_path / "clip"), tmp_path / "out"
+    arguments = ["forecast", str(folder), "--every", "1", "--frame", "1", "--steps", "1", "--out", str(out)]
+    assert cli.main(arguments) == 0
+    kept = out / "frames" / "001_clip" / "000002.jpg"
+    if isinstance(picture, bytes):
+        kept.write_bytes(picture)
+    else:
+        write_pixels(kept, picture)
+    assert cli.main(arguments) == 2
+    told = capsys.readouterr().err
+    assert str(kept) in told and "delete it, and the same command makes it again" in " ".join(told.split())
+    kept.unlink()
+    assert cli.main(arguments) == 0
+
+
+def test_a_file_in_place_of_drive_json(tmp_path: Path, repeater: Repeater, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "drive.json").write_text("no json")
+    arguments = ["forecast", str(write_clip(tmp_path / "clip")), "--every", "1", "--out", str(tmp_path / "out")]
+    assert cli.main([*arguments, "--steps", "1"]) == 2
+    assert "delete the file, or give --out another folder" in " ".join(capsys.readouterr().err.split())
+    assert repeater.calls == []
 
 
 def test_a_folder_of_clips_and_several_inputs(

@@ -133,6 +133,7 @@ def _request(options: commands.Forecast, drives: list[Drive]) -> dict[str, Any]:
         "clips": [_identity(each) for each in drives],
         "steps": steps[0] if len(set(steps)) == 1 else steps,
         **asked,
+        "view": list(options.view or ("source",)),
         "model": None if options.model is None else shipped.about_model(options.model),
         "quality": None if options.model is None else options.quality or quality.USUAL,
     }
@@ -143,7 +144,8 @@ def _identity(drive: Drive) -> str:
     clip, path = drive.clip, Path(drive.text)
     size = f", {path.stat().st_size:,} bytes" if path.is_file() else ""
     rate = "" if clip.fps is None else f" at {clip.fps:g} Hz"
-    return f"{drive.text} ({len(clip)} frames of {clip[0].height} x {clip[0].width} px{rate}{size})"
+    text = path.absolute() if path.exists() else drive.text  # of another working directory it is another clip
+    return f"{text} ({len(clip)} frames of {clip[0].height} x {clip[0].width} px{rate}{size})"
 
 
 def _forecast_all(

@@ -29,6 +29,9 @@ SCORES: Final = "scores.csv"
 #: The folder of the frames.
 FRAMES: Final = "frames"
 
+#: What to do about a damaged image.
+_REMEDY: Final = "delete it, and the same command makes it again"
+
 #: Of the video's images: what H.264 loses is more.
 _QUALITY: Final = 95
 
@@ -59,9 +62,9 @@ class DriveFolder:
         try:
             about = parse_json(read_bytes(path))
         except JsonError as error:
-            raise ValueError(f"{path}: is not JSON ({error}); choose another `out`, or delete the file") from error
+            raise ValueError(f"{path}: is not JSON ({error}); delete the file, or give `out` another folder") from error
         if not isinstance(about, dict) or about.get("format") != FORMAT or not isinstance(about.get("request"), dict):
-            raise ValueError(f"{path}: must have the format {FORMAT!r}; choose another `out`, or delete the file")
+            raise ValueError(f"{path}: must have the format {FORMAT!r}; delete the file, or give `out` another folder")
         kept = about["request"]
         if changed := [key for key in {**self.request, **kept} if kept.get(key) != self.request.get(key)]:
             what = "; ".join(f"{key} {_shown(kept.get(key))} (now {_shown(self.request.get(key))})" for key in changed)
@@ -70,9 +73,9 @@ class DriveFolder:
             )
 
     def has(self, drive: Drive, index: int) -> bool:
-        """Whether frame ``index`` is complete."""
+        """Whether frame ``index`` is complete; one whose lines are damaged is not."""
         picture, rows = self._paths(drive, index)
-        return rows.is_file() and picture.is_file()
+        return rows.is_file() and picture.is_file() and _is_whole(read_bytes(rows), drive.steps)
 
     def add(self, drive: Drive, index: int, rows: Sequence[Sequence[str]], picture: Picture) -> None:
         """Keep a frame's results.
@@ -114,12 +117,19 @@ class DriveFolder:
         firsts = [self._read(drive, drive.indices[0]).shape for drive in drives]
         height, width = max(shape[0] for shape in firsts), max(shape[1] for shape in firsts)
         rate = video_rate(drives)
-        for drive in drives:
+        for drive, first in zip(drives, firsts, strict=True):
             for index, count in zip(drive.indices, repeats(drive, rate), strict=True):
-                yield from itertools.repeat(_on_paper(self._read(drive, index), height, width), count)
+                picture = self._read(drive, index)
+                if picture.shape != first:
+                    sizes = f"{first[0]} x {first[1]} px as the first of its clip, got {picture.shape[:2]}"
+                    raise ValueError(f"{self._paths(drive, index)[0]}: must be {sizes}; {_REMEDY}")
+                yield from itertools.repeat(_on_paper(picture, height, width), count)
 
     def _read(self, drive: Drive, index: int) -> Picture:
-        return np.asarray(read_pixels(self._paths(drive, index)[0]), np.uint8)
+        try:
+            return np.asarray(read_pixels(self._paths(drive, index)[0]), np.uint8)
+        except ValueError as error:
+            raise ValueError(f"{error}; {_REMEDY}") from error
 
     def _paths(self, drive: Drive, index: int) -> tuple[Path, Path]:
         stem = self.folder / FRAMES / drive.folder / f"{index:06}"
@@ -143,6 +153,21 @@ def _csv(rows: Sequence[Sequence[str]]) -> str:
     screen = io.StringIO()
     csv.writer(screen, lineterminator="\n").writerows(rows)
     return screen.getvalue()
+
+
+def _is_whole(content: bytes, steps: int) -> bool:
+    """Whether these are lines of scores.csv, ``steps`` per view and method; none where no view has a truth."""
+    try:
+        lines = list(csv.reader(io.StringIO(content.decode()), strict=True))
+        for line in lines:
+            int(line[len(COLUMNS) - 1])
+            for value in filter(None, line[len(COLUMNS) :]):
+                float(value)
+    except (ValueError, IndexError, csv.Error):
+        return False
+    columns = len(COLUMNS) + len(METRICS)
+    whole = all(len(line) == columns for line in lines) and content[-1:] in (b"", b"\n")
+    return whole and len(lines) % steps == 0
 
 
 def _shown(value: Any) -> str:
