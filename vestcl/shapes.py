@@ -1,6 +1,19 @@
-"""The check of tensors' shapes at public boundaries."""
+"""Checks of arguments at public boundaries: tensors' shapes, and what is a number."""
+
+from numbers import Integral, Real
+from typing import Any
 
 import torch
+
+
+def is_whole(value: Any) -> bool:
+    """Whether it is a whole number, of Python or of NumPy; a truth value is none."""
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+def is_real(value: Any) -> bool:
+    """Whether it is a number, of Python or of NumPy; a truth value is none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def check(**arguments: tuple[torch.Tensor, str]) -> dict[str, int]:

@@ -107,6 +107,15 @@ def test_files_are_read_when_asked(tmp_path: Path) -> None:
     [
         ({"image": np.zeros((6, 8, 3))}, r"`image` must be \[3, H, W\], got \[6, 8, 3\]"),
         ({"image": np.full((3, 6, 8), np.nan)}, "`image` must not have NaN"),
+        ({"image": np.ones((3, 6, 8), np.uint8)}, "got uint8 of 1 ... 1; divide 8-bit values by 255"),
+        ({"image": np.zeros((3, 6, 8), int)}, r"`image` must be RGB in \[0, 1\], floating-point, got int64"),
+        ({"image": np.full((3, 6, 8), 255.0)}, "got 255 ... 255; divide 8-bit values by 255"),
+        ({"image": np.full((3, 6, 8), -np.inf)}, "got -inf ... -inf"),
+        ({"image": np.zeros((3, 6, 8), complex)}, "`image` must be an array .* an array of complex128"),
+        ({"image": "a.png"}, "`image` must be an array"),
+        ({"image": [[1, 2], [3]]}, "`image` must be an array"),
+        ({"image": torch.zeros(3, 6, 8, requires_grad=True)}, "`image` must be an array .*detach"),
+        ({"depth": "a.png"}, "`depth` must be an array"),
         ({"depth": np.zeros((6, 8))}, r"`depth` must be \[1, H, W\], got \[6, 8\]"),
         ({"K": np.eye(4)}, r"K must be \[3, 3\], got \[4, 4\]"),
         ({"K": -np.eye(3)}, "K must be finite, with fx, fy > 0"),
@@ -115,7 +124,7 @@ def test_files_are_read_when_asked(tmp_path: Path) -> None:
         ({"world_from_cam": np.diag([1.0, 1, -1, 1])}, "must be a rotation"),
     ],
 )
-def test_refuses(arguments: dict[str, np.ndarray], message: str) -> None:
+def test_refuses(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Sample.from_arrays(**({"name": "0", "image": np.zeros((3, 6, 8)), "K": K} | arguments))
 

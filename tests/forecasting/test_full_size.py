@@ -18,6 +18,7 @@ from vestcl.forecasting.geometric.forecast import working_frames
 from vestcl.forecasting.network.forecast import forecast_frames as forecast_network
 from vestcl.forecasting.network.learned import REFINEMENT
 from vestcl.forecasting.result import Forecast, LearnedPart, Rendered, View
+from vestcl.forecasting.views import parse_view
 from vestcl.models.forecaster import Forecaster
 
 SIZE = 128, 416
@@ -142,6 +143,34 @@ def test_a_networks_forecast_has_the_clips_size(how: dict[str, Any]) -> None:
     for view in made:
         assert [frame.image.shape for frame in made[view]] == [(3, *SIZE)] * 2
         assert [frame.depth.shape for frame in made[view]] == [(1, *SIZE)] * 2
+
+
+def test_a_view_of_a_narrow_field_is_covered() -> None:
+    """Three times as large, the image's middle is a surface still."""
+    shown = forecast_clip(street(), NOW, 1, [parse_view("0,0,0,fov=30,name=near", street())], work_width=208).frames[0]
+    assert shown["near"].coverage.mean() > 0.95
+
+
+@pytest.mark.parametrize("width", ["160", 160.0, True, [160], float("inf")])
+def test_a_width_that_is_no_whole_number_is_refused(width: Any) -> None:
+    with pytest.raises(ValueError, match="`work_width` must be a whole number of px, or None, got"):
+        Perception(street(), work_width=width)
+    with pytest.raises(ValueError, match="`work_width` must be a whole number of px, or None, got"):
+        vestcl.Live(np.array([[99.0, 0, 80], [0, 99, 24], [0, 0, 1]]), work_width=width)
+
+
+def test_a_width_at_which_nothing_is_left_of_the_height_is_refused() -> None:
+    wide = street().resized(40, 640)
+    with pytest.raises(ValueError, match="`work_width` must be 192 px or more for images of 40 x 640 px, 12 px high"):
+        Perception(wide, work_width=160)
+    assert Perception(wide, work_width=192).clip[0].height == 12
+
+
+@pytest.mark.parametrize("work_width", [None, 208])
+def test_frames_of_two_sizes_are_refused(work_width: int | None) -> None:
+    mixed = Clip("mixed", "arrays", (*street()[:2].samples, street()[2].resized(64, 208)))
+    with pytest.raises(ValueError, match="mixed: frames must have one size, 128 x 416 px as the first, got 64 x 208"):
+        Perception(mixed, work_width=work_width)
 
 
 @pytest.mark.parametrize("width", [0, 1, 63, -5])

@@ -105,6 +105,16 @@ def test_a_network() -> None:
         ({"right_K": K}, "`right_K` is of a stereo rig"),
         ({"K": np.eye(4)}, "K"),
         ({"right_from_left": np.zeros((4, 4))}, "right_from_left"),
+        ({"right_from_left": np.eye(4)}, "`right_from_left` must have t_x < 0"),
+        ({"right_from_left": "rig"}, "`right_from_left` must be a matrix of numbers"),
+        ({"K": "camera"}, "`K` must be a matrix of numbers"),
+        ({"K": 1j * K}, "`K` must be a matrix of numbers: an array of complex128"),
+        ({"fps": "10"}, "`fps` must be above 0 Hz, got '10'"),
+        ({"fps": None}, "`fps` must be above 0 Hz, got None"),
+        ({"steps": 1.5}, "`steps` must be 1 or more, a whole number, got 1.5"),
+        ({"steps": "5"}, "`steps` must be 1 or more, a whole number, got '5'"),
+        ({"quality": "best"}, "`quality` must be one of exact, balanced, fast, got 'best'"),
+        ({"model": 5}, "`model` must be None, a name, a file or a Forecaster, got 5"),
     ],
 )
 def test_what_can_not_be(given: dict[str, Any], message: str) -> None:
@@ -118,7 +128,10 @@ def test_what_can_not_be(given: dict[str, Any], message: str) -> None:
         ({"image": np.zeros((3, 48, 100))}, "`image` must be 48 x 160 px as the frames before, got 48 x 100"),
         ({"image": np.zeros((1, 48, 160))}, "`image` must be"),
         ({"image": np.full((3, 48, 160), np.nan)}, "`image` must not have NaN"),
+        ({"image": np.ones((3, 48, 160), np.uint8)}, "`image` must be RGB in .* divide 8-bit values by 255"),
         ({"timestamp": 0.0}, "`timestamp` must be after 0 s"),
+        ({"timestamp": np.nan}, "`timestamp` must be a finite number of seconds, got nan"),
+        ({"timestamp": "1"}, "`timestamp` must be a finite number of seconds, got '1'"),
         ({"right": np.zeros((3, 48, 160))}, "`right` needs a rig"),
         ({"depth": np.ones((1, 48, 160))}, "`depth` must be given with every frame"),
     ],
@@ -137,9 +150,63 @@ def test_a_rig_without_its_right_image() -> None:
         vestcl.Live(K, right_from_left=RIG).push(np.zeros((3, 48, 160)))
 
 
+def test_a_first_frame_that_is_refused_leaves_no_trace() -> None:
+    live, good = vestcl.Live(K, steps=1), np.random.default_rng(1).random((3, 48, 160))
+    for bad in ({"image": good[:, :8]}, {"image": good, "depth": np.ones((1, 24, 160))}, {"image": 255 * good}):
+        with pytest.raises(ValueError, match="must"):
+            live.push(**bad)
+    assert live.push(good[:, :, :100]) is None
+
+
+def test_after_a_forecast_that_fails_the_same_frame_may_come_again() -> None:
+    images = [each.read_image() for each in clip()[:3]]
+    whole, broken = (vestcl.Live(clip()[0].K, steps=1) for _ in range(2))
+    make = broken._make
+
+    def fails(*given: Any) -> Any:
+        make(*given)
+        raise KeyboardInterrupt
+
+    for number, image in enumerate(images):
+        if number:
+            broken._make = fails
+            with pytest.raises(KeyboardInterrupt):
+                broken.push(image, timestamp=number / 10)
+            broken._make = make
+        one, other = (each.push(image, timestamp=number / 10) for each in (whole, broken))
+        if one is not None and other is not None:
+            same(one, other)
+
+
+def test_a_camera_that_slows_down_for_good() -> None:
+    """Twice the interval from some frame on: no frame is looked at that was dropped."""
+    scene = np.random.default_rng(0).random((3, 24, 100)).astype(np.float32)
+    times = [number / 10 if number < 17 else 1.7 + (number - 17) / 5 for number in range(33)]
+    samples = [Sample.from_arrays(f"{t}", scene[..., i : i + 40], K, timestamp=t) for i, t in enumerate(times)]
+    measured = measurements.Measurements(vestcl.Clip("slower", "arrays", (samples[0],)))
+    for sample in samples[1:]:
+        measured.append(sample, keep=12)
+    assert measured.clip.elapsed(32) == pytest.approx(2)
+    assert not measured.is_lost(32)
+
+
+@pytest.mark.filterwarnings("error")
+def test_after_a_gap_of_half_a_minute_the_camera_moves_on() -> None:
+    live = vestcl.Live(clip()[0].K, steps=1)
+    for sample, time in zip(clip(), (0, 0.1, 0.2, 30.0), strict=False):
+        future = live.push(sample.read_image(), timestamp=time)
+        if future is not None:
+            assert all(np.isfinite(motion).all() for motion in future.forecast.future_from_cur)
+
+
 def test_clips_that_can_not_be() -> None:
     with pytest.raises(ValueError, match="`every` must be 1"):
         vestcl.live(clip(), every=0)
+    with pytest.raises(ValueError, match="`steps` must be 1 or more"):
+        vestcl.live(clip(), steps=0)
+    for views in ([None], 5, ["source", 3.0]):
+        with pytest.raises(ValueError, match="`views` must be cameras, each in words or a View, got"):
+            vestcl.live(clip(), views=views)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="`clip` is open: it takes no fov"):
         vestcl.live(clip(), fov=60)
     with pytest.raises(ValueError, match="2 frames or more"):

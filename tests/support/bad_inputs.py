@@ -156,7 +156,7 @@ def plain(rng: Rng, folder: Path) -> Case:
         rng,
         (
             *("", "dance", "devices now", "doctor --timeout", "demo --model nowhere", "demo --quality best", "bench"),
-            *("demo --device abacus", "bench abacus", "--versions", "forecast", "demo --seed", "doctor --verbose"),
+            *("demo --device abacus", "bench abacus", "--versions", "forecast", "demo --seed", "doctor --loud"),
             *("demo --out", "bench splat --dance", "bench compare", "bench compare nowhere nowhere"),
         ),
     )

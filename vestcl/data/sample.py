@@ -7,7 +7,7 @@ thousands of frames opens at once, and `Sample.resized` costs nothing but a K.
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import Any, Final, overload
 
 import numpy as np
 import torch
@@ -25,6 +25,9 @@ from vestcl.data.sources import (
     RegionSource,
 )
 from vestcl.io.labels import background
+
+#: Values of an image may lie outside [0, 1] by this much, as interpolation leaves them.
+_OVERSHOOT: Final = 0.1
 
 
 class _CameraImage:
@@ -149,11 +152,10 @@ class Sample(_CameraImage):
             timestamp: seconds.
 
         Raises:
-            ValueError: an array of another shape, NaN in the image, or matrices that are no camera or no motion.
+            ValueError: an array of another shape, an image of whole numbers, with NaN or outside [0, 1], or matrices
+                that are no camera or no motion.
         """
-        picture = _planes("image", image, np.float32, 3)
-        if np.isnan(picture).any():
-            raise ValueError("`image` must not have NaN")
+        picture = image_planes("image", image)
         metres = None if depth is None else _planes("depth", depth, np.float32, 1)
         if metres is not None:
             metres = np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0))
@@ -349,8 +351,36 @@ class Clip(Sequence[Sample]):
         return replace(self, samples=tuple(samples))
 
 
+def image_planes(name: str, value: ArrayLike) -> NDArray[np.float32]:
+    """A copy of an image, [3, H, W] RGB in [0, 1].
+
+    Args:
+        name: of the argument, for messages.
+        value: the image.
+
+    Raises:
+        ValueError: another shape, whole numbers, NaN, or values outside [0, 1] by more than `_OVERSHOOT`.
+    """
+    planes = _planes(name, value, np.float32, 3)
+    low, high = float(planes.min()), float(planes.max())
+    if np.isnan(low):
+        raise ValueError(f"`{name}` must not have NaN")
+    kind = getattr(value, "dtype", None)
+    whole = isinstance(kind, np.dtype) and np.issubdtype(kind, np.integer)
+    if whole or low < -_OVERSHOOT or high > 1 + _OVERSHOOT:
+        got = f"{kind} of {low:g} ... {high:g}" if whole else f"{low:g} ... {high:g}"
+        raise ValueError(f"`{name}` must be RGB in [0, 1], floating-point, got {got}; divide 8-bit values by 255")
+    return planes
+
+
 def _planes(name: str, value: ArrayLike, dtype: type[np.generic], channels: int) -> NDArray[Any]:
-    planes = np.asarray(value).astype(dtype)  # a copy, also of the same dtype
+    try:
+        given = np.asarray(value)
+        if np.iscomplexobj(given):
+            raise TypeError(f"an array of {given.dtype}")
+        planes = given.astype(dtype)  # a copy, also of the same dtype
+    except (ValueError, TypeError, RuntimeError) as error:  # the last one of a tensor that needs its gradient
+        raise ValueError(f"`{name}` must be an array [{channels}, H, W] of numbers: {error}") from error
     if planes.ndim != 3 or len(planes) != channels or not planes.size:
         raise ValueError(f"`{name}` must be [{channels}, H, W], got {list(planes.shape)}")
     return planes

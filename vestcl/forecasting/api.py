@@ -19,6 +19,7 @@ from vestcl.forecasting.progress import Progress
 from vestcl.forecasting.result import Forecast, View
 from vestcl.forecasting.views import parse_views
 from vestcl.scene.perception import Perception
+from vestcl.shapes import is_whole
 
 if TYPE_CHECKING:
     from vestcl.models.forecaster import Forecaster
@@ -28,6 +29,9 @@ DEFAULT_STEPS: Final = 5
 
 #: Frames of a street if no number is given.
 STREET_FRAMES: Final = 12
+
+#: Inference presets of a network, best first.
+QUALITIES: Final = ("exact", "balanced", "fast")
 
 
 def open(
@@ -119,6 +123,7 @@ def forecast(
     if seconds is not None:
         steps = times.steps_ahead(seconds, clip.interval, clip.name)
     steps = DEFAULT_STEPS if steps is None else steps
+    check_steps(steps)
     cameras = chosen_views(views, clip, index)
     return Future(clip, index, tuple(cameras), _made(clip, index, steps, cameras, model, quality, progress, how))
 
@@ -129,15 +134,40 @@ def chosen_views(views: str | Iterable[str | View], clip: Clip, index: int) -> l
     Raises:
         ValueError: none, no such view, or two of one name.
     """
-    given = [views] if isinstance(views, str | View) else list(views)
+    given = [views] if isinstance(views, str | View) or not isinstance(views, Iterable) else list(views)
     if not given:
         raise ValueError("`views` must be one camera or more, got none")
+    if wrong := [view for view in given if not isinstance(view, str | View)]:
+        raise ValueError(f"`views` must be cameras, each in words or a View, got {wrong[0]!r}")
     parsed = iter(parse_views([view for view in given if isinstance(view, str)], clip[index]))
     found = [view if isinstance(view, View) else next(parsed) for view in given]
     names = [view.name for view in found]
     if len(set(names)) < len(names):
         raise ValueError(f"`views` must have different names, got {', '.join(names)}")
     return found
+
+
+def check_steps(steps: int) -> None:
+    """Refuse what is no number of steps.
+
+    Raises:
+        ValueError: no whole number, or less than 1.
+    """
+    if not is_whole(steps) or steps < 1:
+        raise ValueError(f"`steps` must be 1 or more, a whole number, got {steps!r}")
+
+
+def check_model(model: Any, quality: str) -> None:
+    """Refuse what is no network and no preset.
+
+    Raises:
+        ValueError: another type, or another word.
+    """
+    if quality not in QUALITIES:
+        raise ValueError(f"`quality` must be one of {', '.join(QUALITIES)}, got {quality!r}")
+    if model is None or isinstance(model, str | Path) or hasattr(model, "config"):
+        return
+    raise ValueError(f"`model` must be None, a name, a file or a Forecaster, got {model!r}")
 
 
 def _made(
@@ -150,6 +180,7 @@ def _made(
     progress: Progress | None,
     how: dict[str, Any],
 ) -> Forecast:
+    check_model(model, quality)
     if model is None:
         from vestcl.forecasting import geometric
 
@@ -167,6 +198,7 @@ Make = Callable[[Perception, int, int, Sequence[View]], Forecast]
 
 def forecaster(model: "str | Path | Forecaster | None", quality: Literal["exact", "balanced", "fast"]) -> Make:
     """What forecasts from frames that were perceived before; arguments as of `forecast`."""
+    check_model(model, quality)
     if model is None:
         from vestcl.forecasting import geometric
 

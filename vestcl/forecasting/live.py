@@ -12,15 +12,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from vestcl.constants import WORK_WIDTH
 from vestcl.data import calibration
-from vestcl.data.sample import Clip, RightCamera, Sample
-from vestcl.forecasting.api import chosen_views, forecaster, open
+from vestcl.data.sample import Clip, RightCamera, Sample, image_planes
+from vestcl.data.sources import ImageArray
+from vestcl.forecasting.api import check_steps, chosen_views, forecaster, open
 from vestcl.forecasting.future import Future
 from vestcl.forecasting.result import View
+from vestcl.scene.flow.optical_flow import FLOW_SIDE
+from vestcl.scene.measurements import check_work_width
 from vestcl.scene.perception import Perception
+from vestcl.shapes import is_real, is_whole
 
 if TYPE_CHECKING:
     from vestcl.models.forecaster import Forecaster
@@ -65,8 +69,9 @@ def live(
             raise ValueError(f"`clip` is open: it takes no {', '.join(options)}")
     else:
         clip = open(clip, **options)
-    if every < 1:
-        raise ValueError(f"`every` must be 1 frame or more, got {every}")
+    if not is_whole(every) or every < 1:
+        raise ValueError(f"`every` must be 1 frame or more, a whole number, got {every!r}")
+    check_steps(steps)
     if len(clip) < 2:
         raise ValueError(f"`clip` must have 2 frames or more, got {len(clip)}")
     cameras, make = chosen_views(views, clip, 1), forecaster(model, quality)
@@ -111,20 +116,24 @@ class Live:
         right_K: ArrayLike | None = None,
         work_width: int | None = WORK_WIDTH,
     ) -> None:
-        if not 0 < fps < np.inf:
-            raise ValueError(f"`fps` must be above 0 Hz, got {fps}")
-        if steps < 1:
-            raise ValueError(f"`steps` must be 1 or more, got {steps}")
+        if not (is_real(fps) and 0 < fps < np.inf):
+            raise ValueError(f"`fps` must be above 0 Hz, got {fps!r}")
+        check_steps(steps)
+        check_work_width(work_width)
         if right_K is not None and right_from_left is None:
             raise ValueError("`right_K` is of a stereo rig; it needs `right_from_left`")
-        self.K, self.fps, self.steps, self.work_width = np.array(K, np.float64), fps, steps, work_width
-        self.views: str | tuple[str | View, ...] = views if isinstance(views, str) else tuple(views)
-        self._rig = None if right_from_left is None else np.array(right_from_left, np.float64)
-        self._right_K = self.K if right_K is None else np.array(right_K, np.float64)
+        self.K, self.fps, self.steps, self.work_width = _matrix("K", K), fps, steps, work_width
+        several = isinstance(views, Iterable) and not isinstance(views, str)
+        self.views: str | tuple[str | View, ...] = tuple(views) if several else views  # type: ignore[assignment]
+        self._rig = None if right_from_left is None else _matrix("right_from_left", right_from_left)
+        self._right_K = self.K if right_K is None else _matrix("right_K", right_K)
         calibration.check_intrinsics(self.K, "K")
         if self._rig is not None:
             calibration.check_rigid(self._rig, "right_from_left")
             calibration.check_intrinsics(self._right_K, "right_K")
+            if not self._rig[0, 3] < 0:
+                wanted = "t_x < 0 (the right camera is to the right)"
+                raise ValueError(f"`right_from_left` must have {wanted}, got {self._rig[0, 3]}")
         self._make = forecaster(model, quality)
         self._perception: Perception | None = None
 
@@ -148,8 +157,9 @@ class Live:
             The future; None for the first frame, from which nothing is known to move.
 
         Raises:
-            ValueError: an image of another shape or size than the first one's, a right image without a rig or none
-                with one, or a time that does not rise. The frame is then as if it had not come.
+            ValueError: an image of another shape or size than the first one's or outside [0, 1], depth of other
+                proportions, a right image without a rig or none with one, or a time that does not rise. The frame is
+                then as if it had not come; likewise where the forecast fails.
         """
         sample = self._sample(image, right, depth, timestamp)
         if self._perception is None:
@@ -157,10 +167,9 @@ class Live:
             chosen_views(self.views, clip, 0)
             self._perception = Perception(clip, work_width=self.work_width)
             return None
-        self._perception.append(sample, keep=_KEPT)
-        clip = self._perception.recorded
-        index, cameras = len(clip) - 1, chosen_views(self.views, clip, len(clip) - 1)
-        return Future(clip, index, tuple(cameras), self._make(self._perception, index, self.steps, cameras))
+        with self._perception.appended(sample, keep=_KEPT) as clip:
+            index, cameras = len(clip) - 1, chosen_views(self.views, clip, len(clip) - 1)
+            return Future(clip, index, tuple(cameras), self._make(self._perception, index, self.steps, cameras))
 
     def _sample(
         self, image: ArrayLike, right: ArrayLike | None, depth: ArrayLike | None, timestamp: float | None
@@ -175,13 +184,30 @@ class Live:
         number = 0 if self._perception is None else len(self._perception.recorded)
         if timestamp is None:
             timestamp = 0.0 if before is None or before.timestamp is None else before.timestamp + 1 / self.fps
+        elif not (is_real(timestamp) and np.isfinite(timestamp)):
+            raise ValueError(f"`timestamp` must be a finite number of seconds, got {timestamp!r}")
         sample = Sample.from_arrays(f"{number:06}", image, self.K, depth=depth, timestamp=timestamp)
         if right is not None and self._rig is not None:
-            there = Sample.from_arrays(f"{number:06} right", right, self._right_K)
-            sample = replace(sample, right=RightCamera(there.image, self._right_K, self._rig))
+            there = ImageArray(image_planes("right", right))
+            sample = replace(sample, right=RightCamera(there, self._right_K, self._rig))
+        if min(sample.height, sample.width) < FLOW_SIDE:
+            got = f"{sample.height} x {sample.width}"
+            raise ValueError(f"`image` must be {FLOW_SIDE} x {FLOW_SIDE} px or larger, got {got}")
+        if sample.depth is not None:
+            sample.read_depth()  # refuses other proportions
         if before is not None:
             _check_follows(sample, before)
         return sample
+
+
+def _matrix(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    try:
+        matrix = np.asarray(value)
+        if np.iscomplexobj(matrix):
+            raise TypeError(f"an array of {matrix.dtype}")
+        return np.array(matrix, np.float64)
+    except (ValueError, TypeError, RuntimeError) as error:  # the last one of a tensor that needs its gradient
+        raise ValueError(f"`{name}` must be a matrix of numbers: {error}") from error
 
 
 def _check_follows(sample: Sample, before: Sample) -> None:

@@ -65,6 +65,12 @@ class KeptResults:
             result: Result = self._kept[key]
             return result
 
+    def forget_all(self) -> None:
+        """Drop all results; they are computed again when asked for."""
+        with self._lock:
+            self._kept.clear()
+            self._lifetimes.clear()
+
     def _forget(self, index: int) -> None:
         """Drop what frame ``index`` and those after it no longer need."""
         for key in list(self._kept):

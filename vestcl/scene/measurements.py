@@ -2,7 +2,8 @@
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Final
 
@@ -18,10 +19,12 @@ from vestcl.scene.depth.lidar import densify
 from vestcl.scene.depth.stereo import stereo_depth
 from vestcl.scene.estimators.sources import EstimatedFrame
 from vestcl.scene.flow.correspondence import Correspondence, correspond
+from vestcl.scene.flow.optical_flow import FLOW_SIDE
 from vestcl.scene.kept_results import KeptResults
 from vestcl.scene.motion.ego_motion import ego_motion
 from vestcl.scene.own_car import own_car
 from vestcl.scene.sky import sky_mask
+from vestcl.shapes import is_whole
 
 #: Standard deviation of a stereo pair's disparity, px, and the nearest depth that is searched for, m.
 _DISPARITY_STD, _NEAREST = 0.35, 2.0
@@ -45,15 +48,45 @@ LEAST_WIDTH: Final = 64
 _LOG: Final = logging.getLogger(__name__)
 
 
+def check_work_width(width: int | None) -> None:
+    """Refuse what is no working width.
+
+    Raises:
+        ValueError: no whole number, or a width below `LEAST_WIDTH`.
+    """
+    if width is None:
+        return
+    if not is_whole(width):
+        raise ValueError(f"`work_width` must be a whole number of px, or None, got {width!r}")
+    if width < LEAST_WIDTH:
+        raise ValueError(f"`work_width` must be {LEAST_WIDTH} px or more, got {width}")
+
+
 def at_work_width(clip: Clip, width: int | None) -> Clip:
     """``clip`` at no more than ``width`` px, in proportion; None is its own.
 
     Raises:
-        ValueError: a width below `LEAST_WIDTH`.
+        ValueError: no whole number, a width below `LEAST_WIDTH`, or one at which the clip is lower than `FLOW_SIDE`.
     """
-    if width is not None and width < LEAST_WIDTH:
-        raise ValueError(f"`work_width` must be {LEAST_WIDTH} px or more, got {width}")
-    return clip if width is None or clip[0].width <= width else clip.fitted(None, width)
+    check_work_width(width)
+    if width is None or clip[0].width <= width:
+        return clip
+    fitted = clip.fitted(None, int(width))
+    if fitted[0].height < FLOW_SIDE <= clip[0].height:
+        least = math.ceil(FLOW_SIDE * clip[0].width / clip[0].height)
+        size = f"images of {clip[0].height} x {clip[0].width} px"
+        raise ValueError(f"`work_width` must be {least} px or more for {size}, {FLOW_SIDE} px high, got {width}")
+    return fitted
+
+
+def _check_one_size(clip: Clip) -> None:
+    first = clip[0]
+    for sample in clip:
+        if (sample.height, sample.width) != (first.height, first.width):
+            sizes = f"{sample.height} x {sample.width} of frame {sample.name}"
+            raise ValueError(
+                f"{clip.name}: frames must have one size, {first.height} x {first.width} px as the first, got {sizes}"
+            )
 
 
 class _Gone:
@@ -86,13 +119,14 @@ class Measurements(KeptResults):
         work_width: px, the largest width that is worked at; None is the clip's own.
 
     Raises:
-        ValueError: a width below `LEAST_WIDTH`.
+        ValueError: as `at_work_width`, or frames of several sizes.
     """
 
     def __init__(
         self, clip: Clip, progress: Callable[[str], None] | None = None, *, work_width: int | None = None
     ) -> None:
         super().__init__(progress)
+        _check_one_size(clip)
         self.recorded, self.clip = clip, at_work_width(clip, work_width)
         self.has_labels = all(sample.labels is not None for sample in clip)
         self._empty: set[int] = set()
@@ -115,6 +149,22 @@ class Measurements(KeptResults):
         self.recorded, self.clip = (_forgotten(each, len(each) - 1 - keep) for each in (recorded, clip))
         if same:
             self.clip = self.recorded
+
+    @contextmanager
+    def appended(self, sample: Sample, *, keep: int) -> Iterator[Clip]:
+        """`append` for a ``with`` block; if that fails, the frame is taken back.
+
+        Yields:
+            The clip with the frame.
+        """
+        before = self.recorded, self.clip
+        try:
+            self.append(sample, keep=keep)
+            yield self.recorded
+        except BaseException:
+            self.recorded, self.clip = before
+            self.forget_all()  # the frame before may have been measured by this one
+            raise
 
     def image(self, index: int) -> NDArray[np.float32]:
         """[3, H, W]."""
@@ -171,10 +221,10 @@ class Measurements(KeptResults):
 
     def is_lost(self, index: int) -> bool:
         """Whether the frame before is too far away in time to be matched, and there is a motion before that."""
-        if index < 2 or self.clip.elapsed(index) < _GAP or self.is_lost(index - 1):
+        if index < 2 or self.clip.elapsed(index) < _GAP:
             return False
         now, before = ((self.correspondence(i).error < _BELIEVED).mean() for i in (index, index - 1))
-        return bool(now < _LOST * before)
+        return bool(now < _LOST * before) and not self.is_lost(index - 1)  # in this order few frames are looked at
 
     def own(self, index: int) -> NDArray[np.bool_]:
         """[1, H, W], True where the recording car itself is in the image: by the clip's own files; found in a video of
