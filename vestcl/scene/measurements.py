@@ -80,8 +80,8 @@ def at_work_width(clip: Clip, width: int | None) -> Clip:
 
 
 def _check_one_size(clip: Clip) -> None:
-    first = clip[0]
-    for sample in clip:
+    first = clip.samples[0]
+    for sample in clip.samples:
         if (sample.height, sample.width) != (first.height, first.width):
             sizes = f"{sample.height} x {sample.width} of frame {sample.name}"
             raise ValueError(
