@@ -170,7 +170,7 @@ def test_a_width_at_which_nothing_is_left_of_the_height_is_refused() -> None:
 def test_frames_of_two_sizes_are_refused(work_width: int | None) -> None:
     mixed = Clip("mixed", "arrays", (*street()[:2].samples, street()[2].resized(64, 208)))
     with pytest.raises(ValueError, match="mixed: frames must have one size, 128 x 416 px as the first, got 64 x 208"):
-        Perception(mixed, work_width=work_width)
+        Perception(mixed, work_width=work_width).image(2)
 
 
 @pytest.mark.parametrize("width", [0, 1, 63, -5])

@@ -81,7 +81,7 @@ def recalled(frames: int, perception: Any = None) -> SceneMemory:
 
 def shown_left(found: SceneMemory, yaw: float) -> Shown:
     """From a camera at t that is turned left by ``yaw`` radians."""
-    return show([_static(found)(0, lambda step: np.eye(4))], K, turned(yaw, 0, 0, (0, 0, 0)), HEIGHT, WIDTH)
+    return show([_static(found, K)(0, lambda step: np.eye(4))], K, turned(yaw, 0, 0, (0, 0, 0)), HEIGHT, WIDTH)
 
 
 # ---------------------------------------------------------------- what is kept

@@ -79,16 +79,6 @@ def at_work_width(clip: Clip, width: int | None) -> Clip:
     return fitted
 
 
-def _check_one_size(clip: Clip) -> None:
-    first = clip.samples[0]
-    for sample in clip.samples:
-        if (sample.height, sample.width) != (first.height, first.width):
-            sizes = f"{sample.height} x {sample.width} of frame {sample.name}"
-            raise ValueError(
-                f"{clip.name}: frames must have one size, {first.height} x {first.width} px as the first, got {sizes}"
-            )
-
-
 class _Gone:
     """The image of a frame that was dropped."""
 
@@ -119,14 +109,13 @@ class Measurements(KeptResults):
         work_width: px, the largest width that is worked at; None is the clip's own.
 
     Raises:
-        ValueError: as `at_work_width`, or frames of several sizes.
+        ValueError: as `at_work_width`; later also for a frame of another size than the first.
     """
 
     def __init__(
         self, clip: Clip, progress: Callable[[str], None] | None = None, *, work_width: int | None = None
     ) -> None:
         super().__init__(progress)
-        _check_one_size(clip)
         self.recorded, self.clip = clip, at_work_width(clip, work_width)
         self.has_labels = all(sample.labels is not None for sample in clip)
         self._empty: set[int] = set()
@@ -168,7 +157,17 @@ class Measurements(KeptResults):
 
     def image(self, index: int) -> NDArray[np.float32]:
         """[3, H, W]."""
-        return self.once("read", index, lambda: self.clip[index].read_image().copy())
+        return self.once("read", index, lambda: self._read(index))
+
+    def _read(self, index: int) -> NDArray[np.float32]:
+        sample, first = self.recorded[index], self.recorded[0]
+        if (sample.height, sample.width) != (first.height, first.width):
+            wanted, got = f"{first.height} x {first.width}", f"{sample.height} x {sample.width}"
+            name = self.clip.name
+            raise ValueError(
+                f"{name}: frames must have one size, {wanted} px as the first, got {got} of frame {sample.name}"
+            )
+        return self.clip[index].read_image().copy()
 
     def full_image(self, index: int) -> NDArray[np.float32] | None:
         """[3, H', W'], the image as it was recorded; None where it has the working size."""
