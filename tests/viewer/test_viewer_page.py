@@ -101,8 +101,11 @@ def test_a_drag_changes_the_picture(viewer: Viewer, clip: vestcl.Clip, tab: Tab)
     assert min(widths) <= WIDTH // 2, "coarse images while it moves"
     moved = shown_view(viewer, clip).tgt_from_next
     assert np.abs(moved - pose).max() > 0.05
-    until(lambda: tab.pixels().shape[1] == WIDTH)  # a slow drag has full images on its way
-    assert np.abs(middle(tab.pixels()).astype(int) - before).mean() > 2
+    images = [tab.pixels()]
+    while images[-1].shape[1] != WIDTH:  # a slow drag has full images on its way, and coarse ones after them
+        tab.wait_for(WIDTH)
+        images.append(tab.pixels())
+    assert np.abs(middle(images[-1]).astype(int) - before).mean() > 2
 
 
 @pytest.mark.parametrize("step", [1, 3])

@@ -119,6 +119,7 @@ class Measurements(KeptResults):
         self.recorded, self.clip = clip, at_work_width(clip, work_width)
         self.has_labels = all(sample.labels is not None for sample in clip)
         self._empty: set[int] = set()
+        self._first = clip.samples[0]
 
     def append(self, sample: Sample, *, keep: int) -> None:
         """Take one more frame, the clip's next; what was found of earlier ones stays.
@@ -160,7 +161,7 @@ class Measurements(KeptResults):
         return self.once("read", index, lambda: self._read(index))
 
     def _read(self, index: int) -> NDArray[np.float32]:
-        sample, first = self.recorded[index], self.recorded[0]
+        sample, first = self.recorded[index], self._first
         if (sample.height, sample.width) != (first.height, first.width):
             wanted, got = f"{first.height} x {first.width}", f"{sample.height} x {sample.width}"
             name = self.clip.name
