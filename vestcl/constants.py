@@ -1,6 +1,6 @@
 """Every number that kernels and Python share, with its reason. Kernels receive them as ``-D`` defines."""
 
-from typing import Final
+from typing import Final, Literal, get_args
 
 #: Points nearer than this (metres, z-depth) make no fragment: in front of it a car's own bonnet ends,
 #: behind it 1/z stays well inside float32.
@@ -51,3 +51,11 @@ SKY_DEPTH: Final = 10_000.0
 #: Frames are perceived and splatted at this width, px, where they are wider and nothing else is asked for;
 #: docs/performance.md has the figures.
 WORK_WIDTH: Final = 960
+
+#: Frames to forecast if neither steps nor seconds are given.
+DEFAULT_STEPS: Final = 5
+
+Quality = Literal["exact", "balanced", "fast"]
+"""Inference presets of a network (`vestcl.models.inference.quality`), best first."""
+
+LEVELS: Final[tuple[Quality, ...]] = get_args(Quality)

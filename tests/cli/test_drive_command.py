@@ -138,8 +138,8 @@ def test_a_damaged_image_is_named(
     else:
         write_pixels(kept, picture)
     assert cli.main(arguments) == 2
-    told = capsys.readouterr().err
-    assert str(kept) in told and "delete it, and the same command makes it again" in " ".join(told.split())
+    message = capsys.readouterr().err
+    assert str(kept) in message and "delete it, and the same command makes it again" in " ".join(message.split())
     kept.unlink()
     assert cli.main(arguments) == 0
 

@@ -146,8 +146,8 @@ def test_a_drive_is_what_single_forecasts_are_and_its_memory_is_bounded() -> Non
         frames.forecast(index, 1, SOURCE)
         kept.append(len(perception._kept) + len(frames._truth._full) + len(frames._truth._looks))
     assert max(kept[6:]) <= max(kept[:6])
-    alone = forecast_clip(clip, 9, 1, SOURCE)
-    assert np.array_equal(seen[9].frames[0]["source"].image, alone.frames[0]["source"].image)
+    single = forecast_clip(clip, 9, 1, SOURCE)
+    assert np.array_equal(seen[9].frames[0]["source"].image, single.frames[0]["source"].image)
 
 
 def filled(folder: DriveFolder, drives: Sequence[Drive], values: Sequence[int] = (40, 120)) -> None:

@@ -5,11 +5,9 @@ from typing import Final
 from vestcl import times
 from vestcl.cli import checks, commands
 from vestcl.cli.options import RANGES
+from vestcl.constants import DEFAULT_STEPS
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
-
-#: Frames to forecast where neither steps nor seconds are given.
-DEFAULT_STEPS: Final = 5
 
 #: Frames of a street up to the current one where no frame is asked for: SPEC section 10.
 STREET_CONTEXT: Final = 4

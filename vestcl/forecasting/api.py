@@ -8,9 +8,10 @@ future.save("out")
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 from vestcl import times
+from vestcl.constants import DEFAULT_STEPS, LEVELS, Quality
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
@@ -24,14 +25,8 @@ from vestcl.shapes import is_whole
 if TYPE_CHECKING:
     from vestcl.models.forecaster import Forecaster
 
-#: Frames to forecast if neither steps nor seconds are given.
-DEFAULT_STEPS: Final = 5
-
 #: Frames of a street if no number is given.
 STREET_FRAMES: Final = 12
-
-#: Inference presets of a network, best first.
-QUALITIES: Final = ("exact", "balanced", "fast")
 
 
 def open(
@@ -83,7 +78,7 @@ def forecast(
     seconds: float | None = None,
     views: str | Iterable[str | View] = ("source",),
     model: "str | Path | Forecaster | None" = None,
-    quality: Literal["exact", "balanced", "fast"] = "balanced",
+    quality: Quality = "balanced",
     progress: Progress | None = None,
     **how: Any,
 ) -> Future:
@@ -163,8 +158,8 @@ def check_model(model: Any, quality: str) -> None:
     Raises:
         ValueError: another type, or another word.
     """
-    if quality not in QUALITIES:
-        raise ValueError(f"`quality` must be one of {', '.join(QUALITIES)}, got {quality!r}")
+    if quality not in LEVELS:
+        raise ValueError(f"`quality` must be one of {', '.join(LEVELS)}, got {quality!r}")
     if model is None or isinstance(model, str | Path) or hasattr(model, "config"):
         return
     raise ValueError(f"`model` must be None, a name, a file or a Forecaster, got {model!r}")
@@ -176,7 +171,7 @@ def _made(
     steps: int,
     views: Sequence[View],
     model: "str | Path | Forecaster | None",
-    quality: Literal["exact", "balanced", "fast"],
+    quality: Quality,
     progress: Progress | None,
     how: dict[str, Any],
 ) -> Forecast:
@@ -186,17 +181,21 @@ def _made(
 
         return geometric.forecast_clip(clip, index, steps, views, progress=progress, **how)
     from vestcl.forecasting.network import forecast as network
+
+    return network.forecast_clip(clip, index, steps, views, _loaded(model, quality), progress=progress, **how)
+
+
+def _loaded(model: "str | Path | Forecaster", quality: Quality) -> "Forecaster":
     from vestcl.models.inference import quality as presets
 
-    network_model = presets.load(model, quality) if isinstance(model, str | Path) else model
-    return network.forecast_clip(clip, index, steps, views, network_model, progress=progress, **how)
+    return presets.load(model, quality) if isinstance(model, str | Path) else model
 
 
 Make = Callable[[Perception, int, int, Sequence[View]], Forecast]
 """(perception, index of the frame t, steps, views) -> forecast."""
 
 
-def forecaster(model: "str | Path | Forecaster | None", quality: Literal["exact", "balanced", "fast"]) -> Make:
+def forecaster(model: "str | Path | Forecaster | None", quality: Quality) -> Make:
     """What forecasts from frames that were perceived before; arguments as of `forecast`."""
     check_model(model, quality)
     if model is None:
@@ -204,7 +203,6 @@ def forecaster(model: "str | Path | Forecaster | None", quality: Literal["exact"
 
         return geometric.forecast_frames
     from vestcl.forecasting.network import forecast as network
-    from vestcl.models.inference import quality as presets
 
-    loaded = presets.load(model, quality) if isinstance(model, str | Path) else model
+    loaded = _loaded(model, quality)
     return lambda perception, index, steps, views: network.forecast_frames(perception, loaded, index, steps, views)

@@ -9,12 +9,12 @@ future = camera.push(left, right=right)                             # None for t
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.constants import WORK_WIDTH
+from vestcl.constants import WORK_WIDTH, Quality
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, RightCamera, Sample, image_planes
 from vestcl.data.sources import ImageArray
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 #: Images of this many frames are kept: a forecast looks at eight, and one of them may be skipped.
 _KEPT: Final = 12
-
-Quality = Literal["exact", "balanced", "fast"]
 
 
 def live(

@@ -1,6 +1,6 @@
 """What any forecast gives, whoever makes it: images of future frames from the cameras that were asked for."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,11 @@ class View:
     """[4, 4] m: from the source camera as it is at the forecast time."""
     K: NDArray[np.float64] | None = None
     """[3, 3] px; None is the source camera's."""
+
+    def resized(self, size: tuple[int, int], new: tuple[int, int]) -> "View":
+        """The same camera for images of another (height, width): diag(sx, sy, 1) K, where it has a K of its own."""
+        factors = new[1] / size[1], new[0] / size[0], 1.0
+        return self if self.K is None else replace(self, K=np.diag(factors) @ self.K)
 
 
 @dataclass(frozen=True, eq=False)

@@ -104,9 +104,8 @@ class Scene:
 
     def _working_view(self, view: View, stride: int) -> View:
         """The view with its K at `_working_size`."""
-        height, width = self._working_size(stride)
-        factors = np.diag([width / self.size[1], height / self.size[0], 1.0])
-        return replace(view, K=factors @ (self.K if view.K is None else view.K))
+        whole = replace(view, K=self.K) if view.K is None else view
+        return whole.resized(self.size, self._working_size(stride))
 
     def moved(self, ahead: float, stride: int = 1) -> list[FrameCloud]:
         """The clouds at a time, kept for the next view: all points, or every ``stride``-th of rows and columns."""

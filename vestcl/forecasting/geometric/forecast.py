@@ -147,11 +147,10 @@ def _render(clouds: Sequence[FrameCloud], perception: Perception, index: int, vi
 
 def working_view(perception: Perception, view: View) -> View:
     """A view of the recorded size at the working size: diag(sx, sy, 1) K, where it has a K of its own."""
-    if view.K is None or perception.recorded is perception.clip:
+    if perception.recorded is perception.clip:
         return view
     recorded, sample = perception.recorded[0], perception.clip[0]
-    factors = sample.width / recorded.width, sample.height / recorded.height, 1.0
-    return replace(view, K=np.diag(factors) @ view.K)
+    return view.resized((recorded.height, recorded.width), (sample.height, sample.width))
 
 
 def at_recorded_size(forecast: Forecast, perception: Perception) -> Forecast:

@@ -10,16 +10,17 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final
 
+from vestcl import constants
 from vestcl.models.forecaster import Forecaster
 from vestcl.models.inference.fast import FastForecaster, accelerate, computes_bfloat16, keep_freed_memory
 from vestcl.models.inference.options import BALANCED, EXACT, FAST, InferenceOptions
 
-Quality = Literal["exact", "balanced", "fast"]
+Quality = constants.Quality
 
 #: The levels, best first.
-LEVELS: Final[tuple[Quality, ...]] = get_args(Quality)
+LEVELS: Final = constants.LEVELS
 
 #: Default of `vestcl forecast`: its loss of quality is not visible.
 USUAL: Final[Quality] = "balanced"
