@@ -132,6 +132,39 @@ def test_what_the_frame_before_showed_is_at_its_place() -> None:
         assert decibels(shown.planes[:3], wanted, where) > decibels(clip[NOW - 1].read_image(), wanted, where) + 4
 
 
+def test_what_the_frame_before_puts_before_what_is_seen_is_left_out() -> None:
+    """A patch of t-1 whose depth is too small by 40 % would stand before what t shows; what t does not show stays."""
+    clip = drive(PLAIN[0], start=PLAIN[1], samples=2).clip
+    depth = clip[NOW - 1].read_depth().copy()
+    patch = np.zeros((1, HEIGHT, WIDTH), bool)
+    patch[0, HEIGHT // 4 : HEIGHT // 2, WIDTH // 4 : WIDTH // 2] = True
+    wrong = np.where(patch, np.float32(0.6) * depth, depth)
+    counts = []
+    for each in (depth, wrong):
+        samples = list(clip.samples)
+        samples[NOW - 1] = replace(clip[NOW - 1], depth=Given(each))
+        seen = Perception(replace(clip, samples=tuple(samples)))
+        cloud = frame_clouds(seen, NOW, point_paths(seen, NOW))[1](1, lambda step: np.eye(4))
+        kept = np.zeros((HEIGHT, WIDTH), bool)
+        kept[cloud.rows, cloud.columns] = True
+        counts.append((kept[patch[0]].mean(), kept[~patch[0]].mean()))
+    (right, elsewhere), (refuted, same) = counts
+    assert right > 0.9 and refuted < right / 2  # the rest lies behind walls that are nearer there
+    assert elsewhere > 0.9 and abs(same - elsewhere) < 0.02
+
+
+@dataclass(frozen=True)
+class Given:
+    """A depth map."""
+
+    depth: Any
+    height: int = HEIGHT
+    width: int = WIDTH
+
+    def read(self) -> Any:
+        return self.depth
+
+
 @dataclass(frozen=True)
 class Exposed:
     """An image of another exposure, 8 bit."""

@@ -195,6 +195,17 @@ def test_an_object_is_held_together() -> None:
     assert np.ptp(whole[1:3, 1]) < 0.85 * np.ptp(torn[1:3, 1]) > 0
 
 
+def test_where_all_candidates_look_alike_the_object_decides() -> None:
+    """A smooth side: its own errors are equal, but those of the rest of its object are not."""
+    objects = np.ones((1, 40), np.int32)
+    errors = np.full((2, 1, 40), 1e-3, np.float32)
+    errors[1, 0, :20] = 8e-3
+    positions = np.zeros((2, 2, 1, 40), np.float32)
+    positions[1, 0] = 10
+    plain, held = (mixed(positions, each)[0, 0, 30] for each in (errors, held_together(errors, objects)))
+    assert plain == 5 and held < 0.5
+
+
 def test_two_frames_mix_velocity_and_residual_flow() -> None:
     depth = np.full((1, 8, 12), 5.0, np.float32)
     one = np.ones((3, 8, 12), np.float32)

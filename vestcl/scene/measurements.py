@@ -14,6 +14,7 @@ from vestcl.data.calibration import power
 from vestcl.data.sample import Clip, Sample
 from vestcl.io.labels import SKY
 from vestcl.scene.depth import CombinedDepth, combine_depth
+from vestcl.scene.depth.foreground import StereoPair
 from vestcl.scene.depth.from_motion import MotionDepth, motion_depth
 from vestcl.scene.depth.lidar import densify
 from vestcl.scene.depth.stereo import stereo_depth
@@ -268,7 +269,7 @@ class Measurements(KeptResults):
         sample = self.clip[index]
         if self.has_labels:
             return sample.read_labels() == SKY
-        if depth is not None and sample.right is not None and self._given_depth(index) is None:
+        if depth is not None and self._is_matched(index):
             return sky_mask(self.image(index), self.raw_depth(index), matched=True)
         return sky_mask(self.image(index), depth)
 
@@ -280,11 +281,22 @@ class Measurements(KeptResults):
             return depth if (depth > 0).mean() >= _DENSE else densify(depth, self.image(index), sky=self._sky(index))
         if sample.right is None:
             return self._from_motion(index).depth
+        pair, rig = self._pair(index), sample.right.right_from_left
+        searched = min(math.ceil(pair.focal / _NEAREST), sample.width // 2)
+        return stereo_depth(pair.left, pair.right, sample.K, rig, max_disparity=searched, fill=False)
+
+    def _pair(self, index: int) -> StereoPair:
+        return self._untimed("pair", index, lambda: self._read_pair(index))
+
+    def _read_pair(self, index: int) -> StereoPair:
+        sample = self.clip[index]
+        assert sample.right is not None
         focal = -float(sample.K[0, 0] * sample.right.right_from_left[0, 3])
-        searched = min(math.ceil(focal / _NEAREST), sample.width // 2)
-        pair = self.image(index), sample.right.read_as(sample.K, sample.height, sample.width)
-        rig = sample.right.right_from_left
-        return stereo_depth(*pair, sample.K, rig, max_disparity=searched, fill=False)
+        return StereoPair(self.image(index), sample.right.read_as(sample.K, sample.height, sample.width), focal)
+
+    def _is_matched(self, index: int) -> bool:
+        """Whether depth comes from the stereo pair."""
+        return self.clip[index].right is not None and self._given_depth(index) is None
 
     def _given_depth(self, index: int) -> NDArray[np.float32] | None:
         """The clip's own depth [1, H, W] m, 0 = invalid; None where it has none, or a map without a valid pixel."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from vestcl.data.sample import Clip
 from vestcl.io.labels import background
+from vestcl.scene.depth.foreground import foreground_depth
 from vestcl.scene.flow.correspondence import Correspondence
 from vestcl.scene.flow.parallax import OtherFrame, refine_depth
 from vestcl.scene.inpainting.inpaint import DEFAULT, inpaint_background
@@ -136,22 +137,20 @@ class Perception(Measurements):
         if index > 0 and not self.is_monocular(index):
             view = OtherFrame(self.correspondence(index), self.prev_from_cur(index))
             depth = refine_depth(depth, self.inverse_std(index), self.clip[index].K, [view], mask & ~own)
-        same = depth is self.raw_depth(index) or (
-            self.clip[index].right is not None and self._given_depth(index) is None
-        )
-        sky = self._measured_sky(index) if same else self._sky(index, depth)
-        return without_gaps(self.image(index), depth, sky)
+        matched = self._is_matched(index)
+        sky = self._measured_sky(index) if matched or depth is self.raw_depth(index) else self._sky(index, depth)
+        complete = without_gaps(self.image(index), depth, sky)
+        return foreground_depth(complete, ~mask & ~own, self._pair(index)) if matched else complete
 
     def _find_moving(self, index: int) -> Moving:
         surface, K = self.surface(index), self.clip[index].K
         instances = objects.segment(surface.mask, surface.depth)
         if index == 0:
             return Moving(instances, np.zeros_like(surface.image))
-        depth = self.raw_depth(index)
+        depth = self._object_depth(index)
         # Two depths whose scales may differ by more than an object moves are not used.
         scaled = self.is_monocular(index) or self.is_monocular(index - 1)
-        before = np.zeros_like(depth) if scaled else self.raw_depth(index - 1)
-        measured = depth, before, self.inverse_std(index)
+        measured = depth, np.zeros_like(depth) if scaled else self._object_depth(index - 1), self.inverse_std(index)
         motion = self.correspondence(index), self.prev_from_cur(index), K
         pair = Pair(surface.image, self.image(index - 1), self.prev_from_cur(index), K)
         by_instance = search(instances, objects.velocities(instances, *measured, *motion), depth, pair)
@@ -159,6 +158,11 @@ class Perception(Measurements):
         by_flow = objects.follow_flow(velocity, surface.image, surface.depth, self._flow(index), *motion[1:])
         velocity = confirmed(by_flow, velocity, surface.depth, pair)
         return Moving(instances, velocity / np.float32(self.clip.elapsed(index)))
+
+    def _object_depth(self, index: int) -> NDArray[np.float32]:
+        """[1, H, W] m, of a stereo pair with what `foreground_depth` mends; 0 = invalid."""
+        depth = self.raw_depth(index)
+        return self._complete_depth(index) if self._is_matched(index) else depth
 
     def _see(self, index: int) -> PerceivedFrame:
         surface, complete = self.surface(index), self._complete_depth(index)

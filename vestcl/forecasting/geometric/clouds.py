@@ -9,8 +9,12 @@ from numpy.typing import NDArray
 from vestcl.forecasting.geometric.frame_cloud import FrameCloud
 from vestcl.forecasting.geometric.memory import SceneMemory
 from vestcl.forecasting.geometric.paths import Paths
-from vestcl.scene.exposure import curve_by_flow
+from vestcl.scene.depth.road_plane import linear, rays_of
+from vestcl.scene.exposure import curve_by_flow, nearest
 from vestcl.scene.perception import Perception
+
+#: A point hides what lies farther by that factor; nearer to the camera than this many metres nothing is compared.
+_IN_FRONT, _NEAREST = 1.1, 0.1
 
 Cameras = Callable[[float], NDArray[np.float64]]
 """``future_from_cur`` [4, 4] m after this many intervals."""
@@ -43,7 +47,9 @@ def frame_clouds(
     full = perception.full_image(index - 1)
     scale = np.float32(perception.scale_before(index))
     velocity, full = scale * perception.moving(index - 1).velocity, None if full is None else curve(full)
-    before = _cloud(curve(prev.image), scale * prev.depth, ~prev.own, K, velocity, *since, full)
+    depth, kept = scale * prev.depth, ~prev.own
+    kept &= ~_refuted(depth, velocity, *since, cur.layers.depth, K)
+    before = _cloud(curve(prev.image), depth, kept, K, velocity, *since, full)
     hidden = ~cur.layers.mask & ~cur.own
     behind = _cloud(cur.layers.background_image, cur.layers.background_depth, hidden, K)
     return [shown, before, *([] if memory is None else [_static(memory, K)]), behind]
@@ -60,6 +66,24 @@ def _shown(paths: Paths, own: NDArray[np.bool_], full: NDArray[np.float32] | Non
         return np.asarray(cv2.transpose(points.astype(np.float32).reshape(3, -1)))
 
     return _moving(moved, z_src, frame.image, rows, columns, frame.K, full)
+
+
+def _refuted(
+    depth: NDArray[np.float32],
+    velocity: NDArray[np.float32],
+    cur_from_src: NDArray[np.float64],
+    elapsed: float,
+    depth_cur: NDArray[np.float32],
+    K: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """[1, H, W], True where a point would hide what the current frame, of ``depth_cur``, shows: it can't be there."""
+    rays = rays_of(K, *depth.shape[1:])
+    u, v, z = (
+        linear(K @ cur_from_src[:3, :3], rays * depth + elapsed * velocity) + (K @ cur_from_src[:3, 3:])[..., None]
+    )
+    ahead = np.maximum(z, _NEAREST)
+    seen = nearest(depth_cur, np.where(z > _NEAREST, u / ahead - 0.5, np.nan), v / ahead - 0.5)
+    return np.asarray(_IN_FRONT * z < seen)
 
 
 def _cloud(

@@ -172,8 +172,10 @@ def by_step(errors: Sequence[Array], by_flow: bool = False) -> tuple[Array, ...]
 
 
 def held_together(errors: Array, objects: NDArray[np.int32]) -> Array:
-    """sqrt(e m) [C, H, W], m the geometric mean of e over the object of a pixel: neighbours that mixed their candidates
-    each in its own way would tear it.
+    """sqrt(e m m / min m) [C, H, W], m the geometric mean of e over the object of a pixel, min m of its best candidate.
+
+    Neighbours that mixed their candidates each in its own way would tear it; and where all candidates look alike, as on
+    a smooth side, the object decides.
 
     Args:
         errors: e [C, H, W], above 0.
@@ -182,7 +184,8 @@ def held_together(errors: Array, objects: NDArray[np.int32]) -> Array:
     logs, number = np.log(errors), objects.ravel()
     count = np.maximum(np.bincount(number), 1)
     means = np.stack([(np.bincount(number, plane.ravel()) / count)[objects] for plane in logs])
-    return np.where(objects > 0, np.exp((logs + means) / 2), errors).astype(np.float32)
+    decided = (logs - means.min(axis=0)) / 2 + means
+    return np.where(objects > 0, np.exp(decided), errors).astype(np.float32)
 
 
 def mixed(positions: Array, errors: Array) -> Array:
