@@ -53,7 +53,7 @@ bench: venv
 	$(BIN)/vestcl bench network
 	$(BIN)/vestcl bench forecast street:
 
-# What `make test` runs a tenth of: interrupts, fuzzed scenes, damaged caches, bad input. Each is seeded and says what failed.
+# What `make test` runs a tenth or a twentieth of: interrupts, fuzzed scenes, damaged caches, bad input. Each is seeded and says what failed.
 stress: venv
 	for script in tests/stress/*.py; do $(BIN)/python "$$script" || exit 1; done
 

@@ -4,6 +4,7 @@ VESTCL_TEST_DEVICES: "all" tests every device, a comma-separated list of selecto
 without it, the default device.
 """
 
+import gc
 import os
 from collections.abc import Iterator
 
@@ -16,11 +17,22 @@ from vestcl.opencl import selection
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
 #: Files whose tests take longest: two processes that begin with them end together.
-LONGEST = ("test_notebooks.py", "test_train_overfit.py", "test_train_ranks.py", "test_prepare_workers.py")
+LONGEST = (
+    "test_notebooks.py", "test_train_ranks.py", "test_prepare_workers.py", "test_train_evaluate.py",
+    "test_train_fit.py", "test_bench_pareto.py", "test_geometric_forecast.py", "test_train_evaluate_preprocessing.py",
+    "test_doctor.py", "test_compile.py", "test_bench_stability.py", "test_uneven_times.py", "test_train_overfit.py",
+    "test_interrupts.py", "test_live.py", "test_packaging.py", "test_viewer_page.py", "test_demo.py",
+)  # fmt: skip
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+
+
+def pytest_collection_finish() -> None:
+    """What is there before the first test stays: neither benches nor tests that collect garbage need to look at it."""
+    gc.collect()
+    gc.freeze()
 
 
 def _devices() -> list[opencl.DeviceInfo]:

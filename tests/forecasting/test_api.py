@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -236,11 +234,3 @@ def test_seconds_in_place_of_steps() -> None:
 def test_what_the_package_has() -> None:
     assert set(vestcl.__all__) == set(dir(vestcl)) and {"open", "forecast", "Forecaster", "splat"} <= set(dir(vestcl))
     assert all(getattr(vestcl, name).__doc__ for name in vestcl.__all__)
-
-
-@pytest.mark.parametrize(
-    "first", ["vestcl.forecasting.result", "vestcl.forecasting.api", "vestcl.cli.main", "vestcl.bench"]
-)
-def test_forecast_is_a_function_after_any_import(first: str) -> None:
-    code = f"import {first}, vestcl; assert callable(vestcl.forecast) and callable(vestcl.open)"
-    subprocess.run([sys.executable, "-c", code], check=True)

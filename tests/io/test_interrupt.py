@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from prepare_scenes import COMMAND
 from stand_ins import put_module
 
 from vestcl import interrupt
@@ -105,8 +104,8 @@ def test_while_a_script_of_train_imports() -> None:
 def test_prepare_ends_its_workers(tmp_path: Path) -> None:
     small = ["--frames", "9", "--height", "16", "--width", "64", "--out", str(tmp_path), "--workers", "2"]
     process = subprocess.Popen(
-        [*COMMAND, "street:1-4", *small], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-        start_new_session=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        [sys.executable, "-m", "vestcl", "prepare", "street:1-4", *small], env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     end = time.monotonic() + 90
     while not list(tmp_path.glob("*/0*.safetensors")) and time.monotonic() < end:

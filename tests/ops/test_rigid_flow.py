@@ -2,15 +2,13 @@
 
 import hashlib
 import math
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from processes import Process
 from tolerances import assert_close, assert_like_reference
 from torch.autograd import gradcheck
 
@@ -159,13 +157,14 @@ def test_same_bits_twice(mapped_session: opencl.Session) -> None:
     assert bits() == bits()
 
 
-def test_same_bits_on_one_compute_unit() -> None:
-    here = Path(__file__).resolve().parent
+def print_bits() -> None:
+    print(bits())
+
+
+def test_same_bits_on_one_compute_unit(tmp_path: Path) -> None:
     one_unit = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1"}
-    path = {"PYTHONPATH": os.pathsep.join([str(here), str(here.parents[1]), str(here.parent / "support")])}
-    command = [sys.executable, "-c", "from test_rigid_flow import bits; print(bits())"]
-    done = subprocess.run(command, env=os.environ | one_unit | path, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == bits()
+    process = Process(tmp_path / "log", print_bits, environment=one_unit)
+    assert process.wait() == 0 and process.output.strip() == bits()
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,13 @@
 
 import dataclasses
 import hashlib
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from processes import Process
 from test_splat import INPUTS, all_of, assert_same_bits, detached, scene
 
 from vestcl import opencl
@@ -46,25 +44,16 @@ def test_twice(mapped_session: opencl.Session, channels: int) -> None:
     assert bits(channels) == bits(channels)
 
 
-def test_any_number_of_threads(session: opencl.Session) -> None:
+def test_any_number_of_threads(session: opencl.Session, tmp_path: Path) -> None:
     if "PoCL" not in session.info.version or session.info.kind != "CPU":
         pytest.skip("only PoCL on a CPU can be given a number of threads to use")
-    here = Path(__file__).resolve().parent
-    path = {
-        "PYTHONPATH": os.pathsep.join([str(here), str(here.parents[1]), str(here.parent / "support")]),
-        "VESTCL_DEVICE": session.info.index,
-    }
-    command = [sys.executable, "-c", "from test_splat_determinism import report; report()"]
-    children = [
-        subprocess.Popen(
-            command,
-            env=os.environ | path | {"POCL_MAX_PTHREAD_COUNT": threads, "POCL_CPU_MAX_CU_COUNT": threads},
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        for threads in ("1", "3")
-    ]
-    reports = [child.communicate()[0].split() for child in children]
+    children = []
+    for threads in ("1", "3"):
+        units = {"POCL_MAX_PTHREAD_COUNT": threads, "POCL_CPU_MAX_CU_COUNT": threads}
+        environment = units | {"VESTCL_DEVICE": session.info.index}
+        children.append(Process(tmp_path / threads, report, environment=environment))
+    assert [child.wait() for child in children] == [0, 0], [child.output for child in children]
+    reports = [child.output.split() for child in children]
     assert [len(words) for words in reports] == [5, 5]
     assert reports[0][0] != reports[1][0], "both children have as many compute units"
     with opencl.use(session.info.index, "tile"):

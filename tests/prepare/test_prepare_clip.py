@@ -2,21 +2,18 @@
 
 import dataclasses
 import signal
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from prepare_scenes import (
-    COMMAND,
     FRAMES,
     HEIGHT,
-    ROOT,
-    SMALL,
     WIDTH,
     contents,
     options,
+    prepare,
     run,
     settings_for,
     until,
@@ -209,7 +206,7 @@ def test_killed_at_any_moment_it_continues(tmp_path: Path, capsys: pytest.Captur
     settings = options("street:5", out=tmp_path / "cache")
     folder = tmp_path / "cache" / f"street_5-{HEIGHT}x{WIDTH}"
     for wanted in (1, 3):  # frames that are there when it is killed
-        process = subprocess.Popen([*COMMAND, "street:5", "--out", str(settings.out), *SMALL], cwd=ROOT)
+        process = prepare(tmp_path / "log", "street:5", "--out", str(settings.out))
         until(frame_path(folder, wanted - 1).exists)
         process.kill()
         assert process.wait() == -signal.SIGKILL

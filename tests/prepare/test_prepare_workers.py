@@ -1,20 +1,18 @@
 """Several processes at the same clips."""
 
 import fcntl
-import subprocess
 from pathlib import Path
 
 import pytest
-from prepare_scenes import COMMAND, FRAMES, HEIGHT, ROOT, SMALL, WIDTH, contents, counted, options, run, until
+from prepare_scenes import FRAMES, HEIGHT, WIDTH, contents, counted, options, prepare, run, until
 
 from vestcl.prepare.files import frame_path
 
 
 def test_two_at_once_compute_every_frame_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = [*COMMAND, "street:5-7", "--out", str(tmp_path / "cache"), *SMALL]
-    both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) for _ in range(2)]
-    done = [counted(process.communicate()[0]) for process in both]
-    assert [process.returncode for process in both] == [0, 0]
+    both = [prepare(tmp_path / name, "street:5-7", "--out", str(tmp_path / "cache")) for name in ("log 1", "log 2")]
+    assert [process.wait() for process in both] == [0, 0]
+    done = [counted(process.output) for process in both]
     assert sum(computed for computed, _ in done) == 3 * FRAMES
     assert [computed + kept for computed, kept in done] == [3 * FRAMES] * 2
     run(options("street:5-7", out=tmp_path / "alone"), capsys)
@@ -26,19 +24,17 @@ def test_other_clips_come_before_one_that_is_taken(tmp_path: Path, capsys: pytes
     taken.mkdir()
     with (taken / ".lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        command = [*COMMAND, "street:5-6", "--out", str(tmp_path), *SMALL]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+        process = prepare(tmp_path / "log", "street:5-6", "--out", str(tmp_path))
         until(lambda: (tmp_path / f"street_6-{HEIGHT}x{WIDTH}" / "clip.json").exists())
-        assert process.poll() is None
+        assert process.runs()
         assert not frame_path(taken, 0).exists()
-    assert counted(process.communicate()[0]) == (2 * FRAMES, 0)
+    assert process.wait() == 0 and counted(process.output) == (2 * FRAMES, 0)
 
 
 def test_workers_make_what_one_process_makes_and_die_with_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = [*COMMAND, "street:5-6", "--out", str(tmp_path / "two"), *SMALL, "--workers", "2"]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, cwd=ROOT)
+    process = prepare(tmp_path / "log", "street:5-6", "--out", str(tmp_path / "two"), "--workers", "2")
     until(lambda: any((tmp_path / "two").rglob("*.safetensors")))
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     process.kill()

@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,16 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from data_files import write_text
+from processes import Process, command
 
 from vestcl.cli import main as cli
 from vestcl.cli import prepare as prepare_command
 from vestcl.io.images import to_pixels, write_pixels
 
-ROOT = Path(__file__).resolve().parents[2]
 HEIGHT, WIDTH, FRAMES = 48, 160, 4
 
-#: The command in a separate process.
-COMMAND = (sys.executable, "-c", "import sys; from vestcl.cli.main import main; sys.exit(main())", "prepare")
 SMALL = ("--height", str(HEIGHT), "--width", str(WIDTH), "--frames", str(FRAMES), "--samples", "1")
 
 
@@ -52,6 +49,11 @@ def run(settings: cli.Prepare, capsys: pytest.CaptureFixture[str]) -> tuple[int,
     """Frames computed, frames kept."""
     prepare_command.run(settings)
     return counted(capsys.readouterr().out)
+
+
+def prepare(log: Path, *arguments: str) -> Process:
+    """The command in a separate process, on small clips."""
+    return Process(log, command, "prepare", *arguments, *SMALL)
 
 
 def counted(text: str) -> tuple[int, int]:

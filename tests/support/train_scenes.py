@@ -4,11 +4,9 @@ As a script it is `train.fit` that knows the small network: ``python tests/suppo
 [--resume]``.
 """
 
-import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,6 +14,7 @@ import pytest
 import torch
 import yaml
 from forecaster_scenes import SMALL, TINY
+from processes import Process
 
 from train import fit
 from train.run import checkpoint
@@ -25,7 +24,6 @@ from vestcl.data import Street, street_clip
 from vestcl.models import config
 from vestcl.prepare.clip import prepare_clip
 
-ROOT: Final = Path(__file__).resolve().parents[2]
 HEIGHT, WIDTH = 48, 160
 
 MODELS: Final = {**config.CONFIGS, "small": SMALL, "small-painting": TINY}
@@ -81,29 +79,17 @@ def write_yaml(path: Path, cache: Path, out: Path, **changes: Any) -> Path:
 
 
 class Processes:
-    """Runs of the command, each in a process forked from one that has loaded torch, but used neither it nor OpenCL."""
+    """Runs of the command, one after the other."""
 
     def __init__(self, folder: Path) -> None:
-        os.environ["PYTHONPATH"] = os.pathsep.join(
-            [str(ROOT), str(ROOT / "tests" / "support"), os.environ.get("PYTHONPATH", "")]
-        )
-        self._folder, self._context = folder, multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["train_scenes"])
-        self.output = ""
-
-    def call(self, function: Callable[..., Any], *arguments: Any, environment: dict[str, str] | None = None) -> int:
-        """Its exit status, negative for a signal; what it printed is in ``output``."""
-        log = self._folder / "output.txt"
-        process = self._context.Process(target=_quietly, args=(log, environment or {}, function, arguments))
-        process.start()
-        process.join(120)
-        self.output = log.read_text()
-        assert process.exitcode is not None, "it hangs"
-        return process.exitcode
+        self._log, self.output = folder / "output.txt", ""
 
     def train(self, *arguments: str, moment: str = "") -> int:
-        """`python -m train.fit` with these arguments, and a signal at that moment."""
-        return self.call(main, list(arguments), environment={MOMENT: moment})
+        """`python -m train.fit` with these arguments, and a signal at that moment; what it prints is ``output``."""
+        self._log.unlink(missing_ok=True)
+        process = Process(self._log, main, list(arguments), environment={MOMENT: moment})
+        status, self.output = process.wait(), process.output
+        return status
 
 
 def main(arguments: list[str]) -> None:
@@ -112,14 +98,6 @@ def main(arguments: list[str]) -> None:
     if os.environ.get(MOMENT):
         _die_at(*os.environ[MOMENT].split())
     sys.exit(fit.main(arguments))
-
-
-def _quietly(log: Path, environment: dict[str, str], function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    with log.open("w", buffering=1) as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-        os.environ.update(environment)
-        function(*arguments)
 
 
 def _die_at(name: str, what: str, step: str, rank: str = "0") -> None:

@@ -8,6 +8,7 @@ takes root; exits with 2 where that is not allowed, with 1 where weights differ 
 """
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
@@ -18,7 +19,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from train_scenes import MOMENT, ROOT, weights, write_yaml
+from processes import ROOT, Process, torchrun
+from train_scenes import MOMENT, weights, write_yaml
 
 from train.run.report import LOG, read_log
 
@@ -30,6 +32,9 @@ PATIENCE: Final = 240.0
 SAME: Final = 1e-6
 #: How torchrun finds out soon that a host is lost.
 _RENDEZVOUS: Final = "keep_alive_interval=1,keep_alive_max_attempt=3,join_timeout=120"
+
+#: CLONE_NEWNET of <sched.h>.
+_NETWORK: Final = 0x40000000
 
 
 class NotAllowedError(Exception):
@@ -71,18 +76,16 @@ class Hosts:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(int(process), signal.SIGKILL)
 
-    def torchrun(self, host: int, program: Sequence[str], log: Path, moment: str = "") -> "subprocess.Popen[bytes]":
+    def torchrun(self, host: int, program: Sequence[str], log: Path, moment: str = "") -> Process:
         """Begin torchrun on a host, with one process of ``program``; both print to ``log``."""
-        command = [
-            "ip", "netns", "exec", self.names[host], sys.executable, "-m", "torch.distributed.run", "--nnodes", "2",
-            "--nproc-per-node", "1", "--max-restarts", "3", "--rdzv-backend", "c10d", "--rdzv-id", "vestcl",
-            "--rdzv-endpoint", f"{ADDRESS}:29400", "--rdzv-conf", f"{_RENDEZVOUS},is_host={int(host == 0)}",
-            "--local-addr", self.addresses[host], *program,
+        options = [
+            "--nnodes", "2", "--nproc-per-node", "1", "--max-restarts", "3", "--rdzv-backend", "c10d",
+            "--rdzv-id", "vestcl", "--rdzv-endpoint", f"{ADDRESS}:29400",
+            "--rdzv-conf", f"{_RENDEZVOUS},is_host={int(host == 0)}", "--local-addr", self.addresses[host],
         ]  # fmt: skip
         own = {MOMENT: moment, "GLOO_SOCKET_IFNAME": self.interfaces[host]}
         own |= {"TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}  # else a lost host can't be replaced
-        with log.open("ab") as output:
-            return subprocess.Popen(command, env=_environment() | own, stdout=output, stderr=subprocess.STDOUT)
+        return Process(log, _enter, self.names[host], options, list(program), environment=own)
 
     def run(self, program: Sequence[str], folder: Path, lost_when: Callable[[], bool] | None = None) -> str:
         """``program`` on both; the second host is lost when ``lost_when`` is true, and started again.
@@ -101,9 +104,9 @@ class Hosts:
             self.kill(1)
             running[1].wait()
             running[1] = self.torchrun(1, program, logs[1])
-        _wait(lambda: all(process.poll() is not None for process in running), logs)
-        if any(process.returncode for process in running):
-            raise RuntimeError(f"exit status {[process.returncode for process in running]}:\n{_printed(logs)}")
+        statuses = [process.wait(PATIENCE) for process in running]
+        if any(statuses):
+            raise RuntimeError(f"exit status {statuses}:\n{_printed(logs)}")
         return _printed(logs)
 
 
@@ -117,9 +120,12 @@ def _ip(*arguments: str) -> str:
     return done.stdout
 
 
-def _environment() -> dict[str, str]:
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "support")])
-    return os.environ | {"PYTHONPATH": paths}
+def _enter(host: str, options: Sequence[str], program: Sequence[str]) -> None:
+    """torchrun in the network namespace ``host``."""
+    with Path("/run/netns", host).open("rb") as namespace:
+        if ctypes.CDLL(None, use_errno=True).setns(namespace.fileno(), _NETWORK):
+            raise OSError(ctypes.get_errno(), f"setns {host}")
+    torchrun(options, program)
 
 
 def _printed(logs: Sequence[Path]) -> str:
@@ -152,7 +158,7 @@ def train_on_one(cache: Path, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     program = training(write_yaml(folder / "run.yaml", cache, folder / "out"))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", *program]
-    subprocess.run(command, env=_environment(), check=True, capture_output=True)
+    subprocess.run(command, check=True, capture_output=True)
 
 
 def prepare_on_both(hosts: Hosts, folder: Path) -> Path:

@@ -1,8 +1,6 @@
 """train.data.windows: batches that follow from (seed, step, position) only."""
 
 import pickle
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -11,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from forecaster_scenes import change
+from processes import Process
 from test_network_input import MOTIONS, prepared
 from torch.nn import functional
 
@@ -23,8 +22,6 @@ from vestcl.ops.unproject import unproject
 from vestcl.prepare.clip import prepare_clip
 from vestcl.prepare.prepared import PreparedClip, find_prepared
 from vestcl.scene.perceived import PerceivedFrame
-
-ROOT = Path(__file__).resolve().parents[2]
 
 HEIGHT, WIDTH, FRAMES = 48, 160, 6
 
@@ -205,16 +202,15 @@ def test_reading_leaves_the_global_generators_unchanged(clips: list[PreparedClip
     assert pickle.dumps(np.random.get_state()) == numpy_before  # noqa: NPY002 - it is what must not change
 
 
-def test_reading_opens_no_device(cache: Path) -> None:
-    code = (
-        "import sys\n"
-        "from train.data.windows import WindowSet, loader\n"
-        "from vestcl.prepare.prepared import find_prepared\n"
-        "windows = WindowSet(find_prepared(sys.argv[1]), crop=(24, 80), flip=True, colour=0.5, right=0.5)\n"
-        "assert len(list(loader(windows, 0, 2, range(2)))) == 2\n"
-        "assert 'libpocl' not in open('/proc/self/maps').read()"
-    )
-    subprocess.run([sys.executable, "-c", code, str(cache)], check=True, cwd=ROOT)
+def test_reading_opens_no_device(cache: Path, tmp_path: Path) -> None:
+    process = Process(tmp_path / "log", read_two_batches, cache)
+    assert process.wait() == 0, process.output
+
+
+def read_two_batches(cache: Path) -> None:
+    windows = WindowSet(find_prepared(cache), crop=(24, 80), flip=True, colour=0.5, right=0.5)
+    assert len(list(loader(windows, 0, 2, range(2)))) == 2
+    assert "libpocl" not in Path("/proc/self/maps").read_text()
 
 
 # ---------------------------------------------------------------- what a batch holds

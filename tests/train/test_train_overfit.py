@@ -15,9 +15,9 @@ from vestcl.data import Street, street_clip
 from vestcl.models.forecaster import Forecaster
 from vestcl.prepare.clip import prepare_clip
 
-#: dB that are to be reached, and updates that may be spent: 29.6 were measured after 120 and 36.2 after 700, from 26.6.
-#: What is static follows only the camera, so refinement has to learn most of it.
-WANTED, STEPS = 29.0, 120
+#: dB that are to be reached, and updates that may be spent: 28.4 were measured after 60, 29.6 after 120 and 36.2 after
+#: 700, from 26.6. What is static follows only the camera, so refinement has to learn most of it.
+WANTED, STEPS = 28.0, 60
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def test_one_window_is_learned(cache: Path, tmp_path: Path) -> None:
     for _ in range(STEPS):
         trainer.update(batch)
     after = decibels(model, batch)
-    assert before < WANTED - 2 and after > WANTED, (before, after)
+    assert before < WANTED - 1 and after > WANTED, (before, after)
 
 
 def decibels(model: Forecaster, batch: Batch) -> float:

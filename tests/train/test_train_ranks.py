@@ -1,9 +1,5 @@
 """train.run.ranks: processes that share a batch reach one process's weights, and resume after a lost process."""
 
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 import two_hosts
+from processes import Process, torchrun
 from torch import distributed
-from train_scenes import MODELS, MOMENT, ROOT, configured, steps, street, weights, write_yaml
+from train_scenes import MODELS, MOMENT, configured, steps, street, weights, write_yaml
 
 from train import fit
 from train.fit import TrainingError
@@ -26,10 +23,6 @@ from vestcl.models import config
 #: of a batch of two add up identically; elsewhere rounding may count for more, as Adam divides gradients by their own
 #: size.
 TOLERANCE = 1e-3
-
-
-#: Seconds until processes that wait for each other are given up.
-PATIENCE = 150
 
 
 @dataclass(frozen=True)
@@ -59,21 +52,20 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run_both(cache: Path, out: Path, moment: str = "") -> str:
     """Two processes under torchrun, which starts them once more after a signal at ``moment``; what they print."""
-    file = write_yaml(out.parent / "run.yaml", cache, out)
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
-               "--max-restarts", "1", str(ROOT / "tests" / "support" / "train_scenes.py"), str(file)]  # fmt: skip
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "support")])
-    environment = {**os.environ, "PYTHONPATH": paths, MOMENT: moment}
-    with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as started:
-        try:
-            reported, _ = started.communicate(timeout=PATIENCE)
-        except subprocess.TimeoutExpired:
-            started.send_signal(signal.SIGTERM)  # torchrun then ends its processes, which a SIGKILL would leave behind
-            raise
-    assert started.returncode == 0, reported
-    return reported
+    file, log = write_yaml(out.parent / "run.yaml", cache, out), out.parent / "output.txt"
+    options = [
+        "--nproc-per-node",
+        "2",
+        "--max-restarts",
+        "1",
+        "--rdzv-backend",
+        "c10d",
+        "--rdzv-endpoint",
+        "localhost:0",
+    ]
+    process = Process(log, torchrun, options, two_hosts.training(file), environment={MOMENT: moment})
+    assert process.wait() == 0, process.output
+    return process.output
 
 
 def test_a_single_process_shares_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
