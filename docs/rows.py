@@ -170,7 +170,7 @@ def presets(content: Mapping[str, Any]) -> Iterator[Row]:
             for name, value in front["qualities"].items()
         }
     else:
-        together = next(rows for title, rows in _tables(device).items() if title.startswith("best of"))
+        together = next(rows for title, rows in tables_of(device).items() if title.startswith("best of"))
         found = {
             name: (value, *(cells[key]["median"] for key in ("time", "PSNR", "MS-SSIM")))
             for name in PRESETS
@@ -207,7 +207,7 @@ def _scenes(device: Mapping[str, Any]) -> Iterator[tuple[str, tuple[str, float, 
             before, after = (scene["seconds"][key]["median"] for key in ("nothing skipped", "all skipped"))
             yield name, (f"{scene['foreground']:.0%}", saved, of_peer), before, after
         return
-    tables = _tables(device)
+    tables = tables_of(device)
     for title, rows in tables.items():
         if title.startswith("forecast step, "):
             name, _, rest = title.removeprefix("forecast step, ").partition(" (")
@@ -232,7 +232,7 @@ def splatting(content: Mapping[str, Any]) -> Iterator[Row]:
             cells = (_time(*each) for each in of)
             yield (f"{facts['radius']:g}", f"{facts['fragments']:,}", *cells, f"{memory[facts['radius']]:.2f}")
         return
-    for name, found in _tables(device)["Splat"].items():
+    for name, found in tables_of(device)["Splat"].items():
         cells = (_time(found[f"{key} ms"]["median"], found[f"{key} x copy"]["median"]) for key in ("forward", "both"))
         radius = name.rpartition("radius ")[2]
         yield (radius, found["fragments"]["text"], *cells, f"{found['x features']['median']:.2f}")
@@ -250,7 +250,7 @@ def opacities(content: Mapping[str, Any]) -> Iterator[Row]:
                 cells = (f"{_worst(of['outputs'])} / {_worst(of['gradients'])}" for of in found)
                 yield (f"opacity {OPACITIES[row['knob']]}", *cells)
         return
-    rows = next(rows for title, rows in _tables(device).items() if title.startswith("opacity:"))
+    rows = next(rows for title, rows in tables_of(device).items() if title.startswith("opacity:"))
     for knob, label in OPACITIES.items():
         if (of := rows.get(f"{knob:.4g}")) is not None:
             found = [
@@ -259,7 +259,7 @@ def opacities(content: Mapping[str, Any]) -> Iterator[Row]:
             yield (f"opacity {label}", *(" / ".join(pair) for pair in found))
 
 
-def _tables(device: Mapping[str, Any]) -> dict[str, dict[str, dict[str, Mapping[str, Any]]]]:
+def tables_of(device: Mapping[str, Any]) -> dict[str, dict[str, dict[str, Mapping[str, Any]]]]:
     """The cells of a bench's long table, by table, row and column."""
     found: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}
     for cell in device["measures"]:

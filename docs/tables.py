@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import bench_rows
 import rows
 from rows import Row
 
@@ -101,6 +102,19 @@ ABLATION: Final = Source(
 )
 SPLAT: Final = Source("docs/results/splat.json", "vestcl bench splat")
 STABILITY: Final = Source("docs/results/stability.json", "vestcl bench stability")
+CAMERA: Final = Source("docs/results/camera.json", "vestcl bench camera 00.txt 06.txt")
+INPAINTING: Final = Source("docs/results/inpaint.json", "vestcl bench inpaint")
+MEMORY: Final = Source(
+    "docs/results/memory.json", "vestcl bench inpaint --clips CLIP ... --windows 4 --memory 0 3 10 --st-lpips FILE"
+)
+NETWORK: Final = Source("docs/results/network.json", "vestcl bench network")
+NETWORK_PAPER: Final = Source(
+    "docs/results/network_paper.json", "vestcl bench network --model vest-paper+colour --runs 2 --no-training"
+)
+TRAIN_STEP: Final = Source("docs/results/train_step.json", "vestcl bench train-step")
+FORECAST_TIMES: Final = Source(
+    "docs/results/forecast_times.json", "python docs/forecast_times.py --work-width 0 960 640 CLIP ..."
+)
 PARETO: Final = Source("docs/time_against_error/pareto.json", "vestcl bench pareto")
 PIPELINE: Final = Source("docs/time_against_error/pipeline.json", "vestcl bench pipeline")
 
@@ -115,6 +129,12 @@ TABLES: Final = {
     "ablation": Table((ABLATION,), rows.ablation),
     "speed": Table((PARETO,), rows.speed),
     "presets": Table((PARETO,), rows.presets),
+    "camera": Table((CAMERA,), bench_rows.camera),
+    "inpainting": Table((INPAINTING,), bench_rows.inpainting),
+    "memory": Table((MEMORY,), bench_rows.memory),
+    "network": Table((NETWORK, NETWORK_PAPER), bench_rows.network),
+    "forecast-times": Table((FORECAST_TIMES,), bench_rows.forecast_times),
+    "train-step": Table((TRAIN_STEP,), bench_rows.training),
     "splat": Table((SPLAT,), rows.splatting),
     "opacities": Table((STABILITY,), rows.opacities),
     "skipping": Table((PIPELINE,), rows.skipping),
@@ -185,7 +205,7 @@ def main() -> int:
 
 def _named(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _named(item) for key, item in value.items() if key not in _DROPPED}
+        return {_named(key): _named(item) for key, item in value.items() if key not in _DROPPED}
     if isinstance(value, list):
         return [_named(item) for item in value]
     if isinstance(value, float):

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import bench_rows
 import pytest
 import rows
 import tables
@@ -184,3 +185,70 @@ def test_a_file_that_is_none_is_named(
 def test_an_unknown_table_is_refused() -> None:
     with pytest.raises(ValueError, match="'colours' must be one of accuracy, "):
         tables.filled("<!-- table: colours -->\n<!-- /table -->")
+
+
+def test_the_cameras_errors_are_next_to_their_ratio_to_constant_velocity() -> None:
+    def part(rotation: float, translation: float) -> dict[str, dict[str, float]]:
+        ours = {"rotation_deg": rotation, "translation_percent": translation}
+        return {"forecast": ours, "constant velocity": {"rotation_deg": 0.5, "translation_percent": 4.0}}
+
+    errors = {"/data/00.txt": {"0.1 s": {"all": part(0.25, 3), "bends": part(0.1, 1), "straights": part(9, 9)}}}
+    _, *found = bench_rows.camera({"errors": errors})
+    assert found == [("00", "0.250 (0.50) / 3.00 (0.75)"), ("00, bends", "0.100 (0.20) / 1.00 (0.25)")]
+
+
+def test_the_best_inpainter_comes_first() -> None:
+    means = {
+        "telea": {"psnr": 14.24, "depth_median": 0.021, "depth_right": 0.8, "seconds": 0.1},
+        "regions": {"psnr": 15.7, "depth_median": 0.01, "depth_right": 0.9, "seconds": 0.04},
+    }
+    _, first, second = bench_rows.inpainting({"means": means})
+    assert first == ("road from road, walls from walls (default)", "15.7", "1.0%", "90%", "0.04")
+    assert second[:2] == ("Telea", "14.2")
+
+
+def test_remembered_frames_are_compared_with_none() -> None:
+    """Filled pixels by their number, delta of the whole image; what was not measured is left out of its mean."""
+    one = {"clip": "a", "open": 0.1, "psnr": 15.0, "st_lpips": 0.02}
+    scores = [
+        {**one, "memory": 0, "filled": 0.0, "whole": 20.0},
+        {**one, "memory": 3, "filled": 0.5, "whole": 20.5},
+        {**one, "memory": 0, "filled": 0.0, "whole": 22.0, "open": 0.3, "psnr": float("nan")},
+        {**one, "memory": 3, "filled": 0.1, "whole": 22.0, "open": 0.3, "st_lpips": None},
+    ]
+    heading, none, three = bench_rows.memory({"scores": scores})
+    assert heading[1:] == ("a; 2 images",)
+    assert none == ("0", "0% / 15.00 / 0.0200 / +0.00") and three == ("3", "20% / 15.00 / 0.0200 / +0.25")
+
+
+def device(title: str, cells: dict[str, dict[str, float]], **config: Any) -> dict[str, Any]:
+    measures = [
+        {"table": title, "row": row, "column": column, "median": median}
+        for row, columns in cells.items()
+        for column, median in columns.items()
+    ]
+    return {"devices": [{"machine": MACHINE, "config": config, "measures": measures}]}
+
+
+def test_stages_of_networks_are_in_ms() -> None:
+    small = device("vest-s, forecast, 256x832", {"encode": {"ms (quartiles)": 0.1}}, model="vest-s")
+    large = device(
+        "vest-paper, forecast, 256x832", {"lift": {"ms (quartiles)": 2}, "peak memory": {"GB": 1.5}}, model="vest-paper"
+    )
+    heading, *found = bench_rows.network(small, large)
+    assert heading == ("median, ms", "vest-s, forecast", "vest-paper, forecast")
+    assert found == [("encode", "100", ""), ("lift", "", "2000"), ("peak memory", "", "1.5 GB")]
+
+
+def test_a_training_steps_share_of_opencl() -> None:
+    cells = {"step, ms (quartiles)": 2.0, "forward, ms": 0.5, "backward, ms": 1.4, "Adam, ms": 0.1, "OpenCL, ms": 0.1}
+    _, row = bench_rows.training(device("training step, vest-s", {"all": cells}))
+    assert row == ("all", "2000", "500", "1400", "100", "5.0%")
+
+
+def test_times_of_commands() -> None:
+    measured = [("a.mp4", 0, 20.4, 1.26), ("a.mp4", 960, 10, 1), ("b", 960, 5, 1)]
+    keys = ("input", "work_width", "cpu_s", "memory_gb")
+    heading, *found = bench_rows.forecast_times({"rows": [dict(zip(keys, each, strict=True)) for each in measured]})
+    assert heading == ("CPU time, memory", "own width", "960 px")
+    assert found == [("a.mp4", "20 s, 1.3 GB", "10 s, 1.0 GB"), ("b", "-", "5 s, 1.0 GB")]

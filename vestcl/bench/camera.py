@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from vestcl.bench.common.estimate import announced
 from vestcl.bench.common.options import JsonOption
-from vestcl.bench.common.results import console, plain, settings, write_json
+from vestcl.bench.common.results import console, describe, plain, settings, write_json
 from vestcl.bench.common.table import Measurement, Section, show_grid
 from vestcl.data.readers.trajectories import KITTI_FPS, read_trajectory
 from vestcl.scene.motion.camera_forecast import CameraForecaster
@@ -80,7 +80,7 @@ def main(config: CameraBench) -> None:
         show_grid(Section(path.name, rows, ("ratio: to constant velocity",)).grid(), screen)
         results[str(path)] = {f"{step * interval:g} s": found[step] for step in steps}
     if config.json is not None:
-        write_json(config.json, plain({"config": settings(config), "errors": results}))
+        write_json(config.json, plain({"machine": describe(), "config": settings(config), "errors": results}))
 
 
 def _rows(ahead: str, parts: Errors) -> Iterator[Measurement]:

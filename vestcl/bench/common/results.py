@@ -184,22 +184,27 @@ def write_json(path: Path, results: dict[str, Any]) -> None:
     atomic.write_bytes(path, (json.dumps(results, indent=1) + "\n").encode())
 
 
-def describe(session: opencl.Session) -> dict[str, str]:
-    """What the numbers depend on: versions, device, processor, date."""
+def describe(session: opencl.Session | None = None) -> dict[str, str]:
+    """What the numbers depend on: versions, processor, date, and the device of ``session``, if one is used."""
     versions = {}
     for package in _PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
+    device = {}
+    if session is not None:
+        device = {
+            "device": f"{session.info.index} {session.info.platform} / {session.info.name}",
+            "driver": session.info.driver,
+            "compute units": str(session.info.compute_units),
+            "mapping": session.mapping,
+        }
     return {
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "vestcl": __version__,
         **versions,
         "python": platform.python_version(),
         "system": platform.platform(),
-        "device": f"{session.info.index} {session.info.platform} / {session.info.name}",
-        "driver": session.info.driver,
-        "compute units": str(session.info.compute_units),
-        "mapping": session.mapping,
+        **device,
         "processor": _processor(),
         "cores": str(os.cpu_count()),
     }

@@ -91,7 +91,7 @@ def main(config: InpaintBench) -> None:
     """Measure and print the tables."""
     console = make_console()
     with opencl.use(config.device) as session:
-        content = {"about": describe(session)} | (_on_clips if config.clips else _on_streets)(config, console)
+        content = {"machine": describe(session)} | (_on_clips if config.clips else _on_streets)(config, console)
     if config.json is not None:
         write_json(config.json, plain(content))
 
