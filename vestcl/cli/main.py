@@ -29,6 +29,7 @@ _BENCHES: Final = {
     "inpaint": "forecast.inpaint",
     "camera": "camera",
     "depth": "depth",
+    "front": "front",
     "forecast": "forecast.bench",
     "compare": "common.compare",
 }
