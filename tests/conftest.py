@@ -8,12 +8,14 @@ import gc
 import os
 from collections.abc import Iterator
 
+import processes
 import pytest
 import torch
 
 from vestcl import opencl
 from vestcl.opencl import selection
 
+processes.preload()
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
 #: Files whose tests take longest: two processes that begin with them end together.

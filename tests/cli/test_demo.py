@@ -17,7 +17,7 @@ from vestcl.models.forecaster import Forecaster
 @pytest.mark.parametrize("model", ["geometric", "vest-s"])
 def test_does_the_whole_job(model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "new" / "folder"
-    demo.run(out, height=96, width=312, seed=4, model=model, steps=3)
+    demo.run(out, height=64, width=208, seed=4, model=model, steps=3)
     said = capsys.readouterr().out.replace("\n", "")
     about = json.loads((out / "forecast.json").read_text(encoding="utf-8"))
     for view in ("source", "right", "beside"):
@@ -25,7 +25,7 @@ def test_does_the_whole_job(model: str, tmp_path: Path, capsys: pytest.CaptureFi
         assert {"000001.png", "000003.png", "000003.exr", "forecast.mp4"} <= set(files)
         assert str(out / view) in said
     with Image.open(out / "sheet.png") as image:
-        assert image.size[0] > 3 * 300
+        assert image.size[0] > 3 * 200
     scores = about["scores"] if "scores" in about else about["metrics"]
     for view in ("source", "right", "beside"):
         of = {method: np.mean([step["psnr"] for step in steps]) for method, steps in scores[view].items()}

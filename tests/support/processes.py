@@ -13,9 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from torch.distributed import run as elastic
-from torch.distributed.launcher.api import elastic_launch
-
 from vestcl.cli import main as cli
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -24,7 +21,14 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 PATIENCE: Final = 150.0
 
 #: torch.optim loads torch._dynamo late.
-_PRELOADED: Final = ("train_scenes", "vestcl.prepare.workers", "torch._dynamo", "torch.utils.tensorboard")
+_PRELOADED: Final = ("train_scenes", "torch.distributed.run", "torch._dynamo", "torch.utils.tensorboard")
+
+
+def preload() -> None:
+    """Let the first process that is forked make the one that all are forked from load `_PRELOADED`."""
+    paths = [str(ROOT), str(ROOT / "tests" / "support"), os.environ.get("PYTHONPATH", "")]
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, dict.fromkeys(paths)))
+    multiprocessing.get_context("forkserver").set_forkserver_preload(list(_PRELOADED))
 
 
 class Process:
@@ -33,12 +37,9 @@ class Process:
     def __init__(
         self, log: Path, function: Callable[..., Any], *arguments: Any, environment: Mapping[str, str] | None = None
     ) -> None:
-        paths = [str(ROOT), str(ROOT / "tests" / "support"), os.environ.get("PYTHONPATH", "")]
-        os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))  # of the process that they are forked from
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(list(_PRELOADED))
         self._log = log
-        self._process = context.Process(target=_logged, args=(log, dict(environment or {}), function, arguments))
+        context, given = multiprocessing.get_context("forkserver"), dict(environment or {})
+        self._process = context.Process(target=_logged, args=(log, given, function, arguments))
         self._process.start()
         self.pid = self._process.pid or 0
 
@@ -99,6 +100,9 @@ def program(*arguments: str) -> None:
 
 def torchrun(options: Sequence[str], arguments: Sequence[str]) -> None:
     """`torchrun OPTIONS ARGUMENTS`, whose processes are forked as well."""
+    from torch.distributed import run as elastic
+    from torch.distributed.launcher.api import elastic_launch
+
     config, _, _ = elastic.config_from_args(elastic.parse_args([*options, *arguments]))
     config.start_method = "fork"
     elastic_launch(config, program)(*arguments)

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from processes import ROOT, Process, torchrun
+from processes import ROOT, Process, preload, torchrun
 from train_scenes import MOMENT, weights, write_yaml
 
 from train.run.report import LOG, read_log
@@ -188,6 +188,7 @@ def distance(out: Path, other: Path) -> float:
 
 
 def main() -> int:
+    preload()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:

@@ -381,7 +381,7 @@ def loader(
         sampler=steps,
         num_workers=workers,
         collate_fn=_as_it_is,
-        multiprocessing_context="spawn" if workers else None,  # a fork would copy a running OpenCL driver's locks
+        multiprocessing_context="forkserver" if workers else None,  # a fork would copy a running OpenCL driver's locks
         persistent_workers=workers > 0,
         generator=torch.Generator(),  # else each start draws a number from the global one
     )

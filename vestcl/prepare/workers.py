@@ -90,11 +90,12 @@ def _run_here(tasks: Sequence[Task], work: Work, summary: Summary, advance: Adva
 
 
 def _run_apart(tasks: Sequence[Task], work: Work, summary: Summary, advance: Advance, workers: int) -> None:
-    """The same in separate processes."""
-    spawn = multiprocessing.get_context("spawn")
-    frames: multiprocessing.Queue[bool] = spawn.Queue()
+    """The same in separate processes, forked from one that has loaded torch, but used neither it nor OpenCL."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    frames: multiprocessing.Queue[bool] = context.Queue()
     others = set(multiprocessing.active_children())
-    with ProcessPoolExecutor(workers, spawn, _start_worker, (frames, workers)) as pool:
+    with ProcessPoolExecutor(workers, context, _start_worker, (frames, workers)) as pool:
         try:
             for waits in (False, True):
                 with interrupt.shielded():  # which starts the processes

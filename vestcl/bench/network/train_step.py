@@ -74,12 +74,7 @@ class TrainStepBench(Options):
 
 
 def main(config: TrainStepBench) -> None:
-    """Measure, print and write.
-
-    Raises:
-        ValueError: a size, number or time that is not positive, or a model that isn't known.
-        DeviceError: no such device.
-    """
+    """Measure, print and write."""
     results.check_positive(config, "height", "width", "batch", "seconds", "threads")
     results.run("train-step", config, partial(_sections, config, configuration(config.model)))
 

@@ -89,12 +89,7 @@ class Operator:
 
 
 def main(config: OperatorsBench) -> None:
-    """Measure, print and write.
-
-    Raises:
-        ValueError: a size or time that is not positive.
-        DeviceError: no such device.
-    """
+    """Measure, print and write."""
     _results.check_positive(config, "height", "width", "channels", "radius", "seconds", "threads")
     _results.run("operators", config, partial(_sections, config), lambda seconds, _: seconds * _OPERATORS)
 
@@ -125,12 +120,6 @@ def measure(operator: Operator, seconds: float, threads: int, peer: bool = True)
 
     Bytes are read and written, every array once. The error is the largest of the results' distances to the reference's,
     relative, in the Euclidean norm.
-
-    Args:
-        operator: with its arguments.
-        seconds: about how long the turns take.
-        threads: of the copies.
-        peer: whether the reference is timed, and the error measured.
 
     Returns:
         A row for each of `PASSES`.
