@@ -100,6 +100,9 @@ def evaluate(world_from_cam: Array, seconds: Array, steps: Sequence[int], config
         seconds: [N].
         steps: frames ahead, rising.
         config: noise, seeds and history.
+
+    Raises:
+        ValueError: a drive too short for its steps.
     """
     frames = np.arange(_FIRST, len(seconds) - steps[-1])
     if not len(frames):

@@ -58,7 +58,11 @@ class DepthBench(JsonOption):
 
 
 def main(config: DepthBench) -> None:
-    """Measure, and print a table for each clip."""
+    """Measure, and print a table for each clip.
+
+    Raises:
+        ValueError: an input that is no clip, has no depth to compare with, or no such frame; as the network's loader.
+    """
     network = load_estimators(config.depth_model, None).depth
     screen, results = console(), dict[str, Any]()
     for text in config.inputs:
@@ -84,6 +88,9 @@ def evaluate(clip: Clip, network: DepthOf | None, config: DepthBench) -> dict[st
         clip: with depth or a right camera.
         network: [3, H, W] RGB in [0, 1] -> [1, H, W] m; None leaves out what needs one.
         config: frames and crop.
+
+    Raises:
+        ValueError: no depth to compare with, or no such frame.
     """
     if clip[0].depth is None and clip[0].right is None:
         raise ValueError(f"{clip.name}: must have depth or a right camera to compare with")

@@ -29,7 +29,12 @@ def duration(seconds: float) -> str:
 
 
 def first_call(seconds: float, tasks: int) -> None:
-    """Report the seconds that a measurement of so many tasks will take: by `announcing`, if it is the first."""
+    """Report how long a measurement that begins will take: by `announcing`, if it is the first.
+
+    Args:
+        seconds: of the measurement.
+        tasks: that it times.
+    """
     listener = _listener.get()
     if listener is not None:
         listener(seconds, tasks)
@@ -37,7 +42,12 @@ def first_call(seconds: float, tasks: int) -> None:
 
 @contextlib.contextmanager
 def announcing(console: Console, total: Total | None = None) -> Iterator[None]:
-    """Inside the ``with`` block the first `first_call` prints how long all will take."""
+    """Inside the ``with`` block the first `first_call` prints how long all will take.
+
+    Args:
+        console: where to.
+        total: of the bench; None is one measurement.
+    """
 
     def announce(seconds: float, tasks: int) -> None:
         _listener.set(None)
@@ -51,7 +61,13 @@ def announcing(console: Console, total: Total | None = None) -> Iterator[None]:
 
 
 def first_of(count: int, console: Console, unit: str) -> Callable[[], None]:
-    """What is to be called after each of ``count`` equal parts: the first call prints how long all will take."""
+    """What is to be called after each of ``count`` equal parts: the first call prints how long all will take.
+
+    Args:
+        count: of the parts.
+        console: where to.
+        unit: what they are, "windows".
+    """
     start, done = time.perf_counter(), 0
 
     def part_done() -> None:
@@ -64,7 +80,13 @@ def first_of(count: int, console: Console, unit: str) -> Callable[[], None]:
 
 
 def announced(items: Sequence[Item], console: Console, unit: str) -> Iterator[Item]:
-    """The items, of about equal work; after the first one's a line says how long all will take."""
+    """The items; after the first one's work a line says how long all will take.
+
+    Args:
+        items: of about equal work, which is done before the next is asked for.
+        console: where to.
+        unit: what they are, "windows".
+    """
     part_done = first_of(len(items), console, unit)
     for item in items:
         yield item

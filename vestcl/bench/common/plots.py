@@ -113,7 +113,11 @@ def file_name(title: str) -> str:
 
 
 def write(figure: "Figure", path: Path) -> None:
-    """Write ``figure`` as a PNG, which is replaced whole."""
+    """Write ``figure`` as a PNG, which is replaced whole.
+
+    Raises:
+        ValueError: the folder can't be made.
+    """
     content = io.BytesIO()
     figure.savefig(content, format="png")
     atomic.write_bytes(path, content.getvalue())

@@ -50,7 +50,11 @@ _PACKAGES: Final = ("torch", "numpy", "pyopencl", "pocl-binary-distribution")
 
 
 def check_positive(config: Any, *names: str) -> None:
-    """Refuse settings that are not above 0."""
+    """Refuse settings that are not above 0.
+
+    Raises:
+        ValueError: the message names the first.
+    """
     for name in names:
         if getattr(config, name) <= 0:
             raise ValueError(f"`{name}` must be positive, got {getattr(config, name)}")
@@ -97,6 +101,9 @@ def run(
         config: its options.
         measure: gives the sections of a device.
         total: how long it takes; None is one measurement, or `vestcl.bench.common.estimate.announced` reports it.
+
+    Raises:
+        DeviceError: as `measure_each`.
     """
     screen, results = console(), list[Results]()
 
@@ -168,7 +175,12 @@ def console(width: int | None = None) -> Console:
 
 
 def write_json(path: Path, results: dict[str, Any]) -> None:
-    """Write ``results`` whole or not at all; ``path`` is the old file until then."""
+    """Write ``results`` whole or not at all; ``path`` is the old file until then.
+
+    Raises:
+        TypeError: a value that JSON does not have.
+        ValueError: the folder can't be made.
+    """
     atomic.write_bytes(path, (json.dumps(results, indent=1) + "\n").encode())
 
 
@@ -214,6 +226,9 @@ def save(results: Sequence[Results], json: Path | None, markdown: Path | None) -
         results: of one benchmark, a device each, one or more.
         json: file {"vestcl": 1, "bench": ..., "devices": [{"machine", "config", "measures": [a row each]}]}, or None.
         markdown: file with machine and tables of each device, or None.
+
+    Raises:
+        ValueError: a value that `plain` refuses, a folder that can't be made.
     """
     if json is not None:
         devices = [

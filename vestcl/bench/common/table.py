@@ -108,7 +108,11 @@ class Section:
         return pd.DataFrame([{"table": self.title} | row for row in rows])
 
     def grid(self) -> Grid:
-        """Rows by columns, both in the order of their first cells; empty where there is none."""
+        """Rows by columns, both in the order of their first cells; empty where there is none.
+
+        Raises:
+            ValueError: two measurements in one cell.
+        """
         frame = self.frame[self.frame["column"] != ""]
         wide = frame.pivot(index="row", columns="column", values="text")
         wide = wide.reindex(index=frame["row"].unique(), columns=frame["column"].unique()).fillna("")

@@ -47,7 +47,12 @@ _FACTS: Final = {
 
 
 def main(config: ForecastBench) -> None:
-    """Forecast, score, print and write."""
+    """Forecast, score, print and write.
+
+    Raises:
+        ValueError: a number out of range, an input that is no clip or has too few frames.
+        DeviceError: no such device.
+    """
     check(config)
     console = _results.console()
     with opencl.use(config.device) as session:
@@ -98,7 +103,12 @@ def as_json(group: Group) -> dict[str, Any]:
 
 
 def grids_of(groups: Sequence[Group], horizons: Sequence[int]) -> list[tables.Grid]:
-    """Each group's images, their 95 % intervals where it has several clips, its facts, and a table over all groups."""
+    """Each group's images, their 95 % intervals where it has several clips, its facts, and a table over all groups.
+
+    Args:
+        groups: measured.
+        horizons: the steps to show, from 1.
+    """
     grids = []
     for group in groups:
         grids += tables.picture_grids(group.title, group.records, horizons)
@@ -114,7 +124,13 @@ def grids_of(groups: Sequence[Group], horizons: Sequence[int]) -> list[tables.Gr
 
 
 def fact_grids(name: str, facts: Sequence[Facts], horizons: Sequence[int]) -> list[tables.Grid]:
-    """A table of what is known besides images, if anything is."""
+    """A table of what is known besides images, if anything is.
+
+    Args:
+        name: what the windows are of.
+        facts: of all windows.
+        horizons: the steps to show, from 1.
+    """
     found = tables.means([fact.values for fact in facts])
     rows = [
         Measurement(label, f"t+{k}", found[metric][k - 1], digits=digits)
@@ -127,7 +143,13 @@ def fact_grids(name: str, facts: Sequence[Facts], horizons: Sequence[int]) -> li
 
 
 def overview(groups: Sequence[Group], view: str, horizons: Sequence[int]) -> tables.Grid:
-    """A table of one view over all groups: a row a group and method."""
+    """A table of one view over all groups: a row a group and method.
+
+    Args:
+        groups: measured.
+        view: its name.
+        horizons: the steps to show, from 1.
+    """
     of_view = {group.title: [record for record in group.records if record.view == view] for group in groups}
     records = [record for own in of_view.values() for record in own]
     steps, shown, rows = tables.steps_of(records, horizons), _headline(records), list[Measurement]()

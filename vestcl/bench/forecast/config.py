@@ -86,7 +86,11 @@ class ForecastBench:
 
 
 def check(config: ForecastBench) -> None:
-    """Refuse options that can't be."""
+    """Refuse options that can't be.
+
+    Raises:
+        ValueError: one out of range.
+    """
     for name in ("steps", "every", "first", "height", "width", "street_frames", "samples"):
         if getattr(config, name) < 1:
             raise ValueError(f"`{name}` must be 1 or more, got {getattr(config, name)}")

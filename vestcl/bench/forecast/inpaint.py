@@ -160,7 +160,11 @@ def score(
 
 
 def windows_of(clip: Clip, count: int, memory: Sequence[int]) -> list[int]:
-    """``count`` current frames spread over the clip, each with the frames that are remembered and forecast."""
+    """``count`` current frames spread over the clip, each with the frames that are remembered and forecast.
+
+    Raises:
+        ValueError: the clip is too short.
+    """
     first, last = max(1, max(memory) + 1), len(clip) - 1 - max(STEPS)
     if last < first:
         raise ValueError(f"{clip.name}: must have {first + max(STEPS) + 1} frames or more, got {len(clip)}")
@@ -171,6 +175,12 @@ def measure_open(
     clip: Clip, indices: Sequence[int], memory: Sequence[int], distance: StLpips | None
 ) -> Iterator[dict[str, Any]]:
     """Scores of all windows, steps and cameras of a clip, and of each number of remembered frames.
+
+    Args:
+        clip: at the size that is scored.
+        indices: the current frames t, ascending.
+        memory: numbers of frames.
+        distance: ST-LPIPS, if its weights are there.
 
     Yields:
         "clip", "index", "step", "view", "memory", "open" (share of the image that t and t-1 don't cover), "filled"

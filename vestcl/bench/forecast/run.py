@@ -67,7 +67,15 @@ class Networks:
 
 
 class Kept:
-    """The file of measured windows at ``path``, or none; ``settings`` are what scores depend on besides the source."""
+    """The file of measured windows.
+
+    Args:
+        path: of the file; None keeps nothing.
+        settings: what scores depend on, next to the source code.
+
+    Raises:
+        ValueError: the file can't be read or written.
+    """
 
     def __init__(self, path: Path | None, settings: Mapping[str, Any]) -> None:
         self.path, self.key = path, key_of(settings)
@@ -81,7 +89,11 @@ class Kept:
         return self._windows.get((clip, index))
 
     def add(self, clip: str, index: int, window: Window) -> None:
-        """Keep a window; it is on the disk when this returns."""
+        """Keep a window; it is on the disk when this returns.
+
+        Raises:
+            ValueError: the file can't be written.
+        """
         self._windows[clip, index] = window
         if self.path is None:
             return
@@ -139,13 +151,21 @@ def _window(entry: Mapping[str, Any]) -> Window:
 
 
 def kept_windows(config: ForecastBench) -> Kept:
-    """What an earlier, stopped run with the same settings and code has measured, next to ``config.out``."""
+    """What an earlier, stopped run with the same settings and code has measured, next to ``config.out``.
+
+    Raises:
+        ValueError: the file can't be read.
+    """
     settings = {name: value for name, value in dataclasses.asdict(config).items() if name not in _OF_TABLES}
     return Kept(None if config.out is None else config.out.with_name(config.out.name + SUFFIX), settings)
 
 
 def run(groups: Sequence[Group], config: ForecastBench, networks: Networks, kept: Kept, console: Console) -> None:
-    """Measure all windows that are not kept yet, and fill the groups."""
+    """Measure all windows that are not kept yet, and fill the groups.
+
+    Raises:
+        ValueError: as the readers and forecasts; a window can't be kept.
+    """
     wanted = [(clip.name, index) for group in groups for clip, chosen in group.clips for index in chosen]
     announce = first_of(sum(kept.get(*window) is None for window in wanted), console, "windows")
     with progress_bar(console, counted=True) as bar:
@@ -170,8 +190,17 @@ def run_clip(
 ) -> Iterator[Window]:
     """Windows of a clip, in order; each shares its perception with the next.
 
+    Args:
+        clip: at its own size.
+        indices: the current frames t, ascending.
+        config: which views and steps.
+        networks: that score, and that forecast.
+
     Yields:
         A window's records, and its facts.
+
+    Raises:
+        ValueError: as `vestcl.forecasting.geometric.forecast_frames`; the clip has none of the views.
     """
     views, steps = views_of(clip, config), config.steps
     perception = Perception(clip, work_width=config.work_width or None)
@@ -191,7 +220,11 @@ def run_clip(
 
 
 def views_of(clip: Clip, config: ForecastBench) -> list[View]:
-    """The wanted cameras that the clip has."""
+    """The wanted cameras that the clip has.
+
+    Raises:
+        ValueError: it has none of them.
+    """
     there = [name for name in config.views if name != "right" or clip[0].right is not None]
     if not there:
         raise ValueError(f"`views` must have a camera of {clip.name}, which has no right one")

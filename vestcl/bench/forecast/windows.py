@@ -62,7 +62,11 @@ class Group:
 
 
 def groups_of(config: ForecastBench) -> list[Group]:
-    """The inputs with their windows; with ``config.pool`` one group."""
+    """The inputs with their windows; with ``config.pool`` one group.
+
+    Raises:
+        ValueError: as `clips_of`; a clip that the list of windows lacks.
+    """
     listed = None if config.windows is None else read_list(config.windows)
     groups, estimators = [], load_estimators(config.depth_model, config.mask_model)
     for text in config.inputs:
@@ -80,6 +84,9 @@ def clips_of(text: str, config: ForecastBench) -> list[Clip]:
     Args:
         text: "street:", "street:SEED", "street:FIRST-LAST", or what `vestcl.data.open.open_sequence` opens.
         config: how streets are made.
+
+    Raises:
+        ValueError: no clip.
     """
     streets = street_input.parse(text)
     if streets is None:
@@ -94,6 +101,11 @@ def clips_of(text: str, config: ForecastBench) -> list[Clip]:
 
 def chosen_windows(clip: Clip, config: ForecastBench, listed: Mapping[str, Listed] | None = None) -> list[int]:
     """The windows of a clip that are measured: frames t with one frame before and ``steps`` after, an interval apart.
+
+    Args:
+        clip: of any length.
+        config: ``first``, ``last``, ``every`` and ``steps``.
+        listed: the list of windows by clip; None takes those of ``config``.
 
     Raises:
         ValueError: none, a clip that is not listed, or a listed window without true frames.
@@ -117,7 +129,11 @@ def chosen_windows(clip: Clip, config: ForecastBench, listed: Mapping[str, Liste
 
 
 def read_list(path: Path) -> dict[str, Listed]:
-    """The list of windows, by clip."""
+    """The list of windows, by clip.
+
+    Raises:
+        ValueError: no such file, or something else in it.
+    """
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     return {name: _listed(f"{path}: {name}", of) for name, of in read_object(path, wanted="an object, by clip").items()}

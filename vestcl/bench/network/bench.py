@@ -61,7 +61,12 @@ class NetworkBench(Options):
 
 
 def main(config: NetworkBench) -> None:
-    """Measure, print and write."""
+    """Measure, print and write.
+
+    Raises:
+        ValueError: a size or number that is not positive, or a model that isn't known.
+        DeviceError: no such device.
+    """
     _results.check_positive(config, "height", "width", "runs", "threads", "batch")
     _results.run("network", config, partial(_sections, config, configuration(config.model)))
 

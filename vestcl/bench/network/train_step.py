@@ -74,7 +74,12 @@ class TrainStepBench(Options):
 
 
 def main(config: TrainStepBench) -> None:
-    """Measure, print and write."""
+    """Measure, print and write.
+
+    Raises:
+        ValueError: a size, number or time that is not positive, or a model that isn't known.
+        DeviceError: no such device.
+    """
     results.check_positive(config, "height", "width", "batch", "seconds", "threads")
     results.run("train-step", config, partial(_sections, config, configuration(config.model)))
 

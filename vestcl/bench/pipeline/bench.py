@@ -64,14 +64,23 @@ class PipelineBench(Options):
 
 
 def main(config: PipelineBench) -> None:
-    """Measure, print and write."""
+    """Measure, print and write.
+
+    Raises:
+        ValueError: a size, number or time that is too small, a size that is no multiple of 16, or no such model.
+        DeviceError: no such device.
+    """
     _check(config)
     scenes = len(set(config.scenes))
     _results.run("pipeline", config, partial(_sections, config, load(config)), lambda seconds, _: seconds * scenes)
 
 
 def load(config: PipelineBench) -> Forecaster:
-    """The network as it is to run."""
+    """The network as it is to run.
+
+    Raises:
+        ValueError: no such model.
+    """
     model = quality.apply(Forecaster.from_pretrained(config.model), config.quality)
     if config.precision is not None:
         precision = None if config.precision == "float32" else config.precision

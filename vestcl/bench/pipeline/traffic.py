@@ -83,7 +83,11 @@ class Drive:
 
 
 def drive(name: str, height: int, width: int, frames: int, seed: int) -> Drive:
-    """One of STREETS or EVERYTHING, with LEAST_FRAMES ``frames`` or more of ``height`` x ``width`` px, in float32."""
+    """One of STREETS or EVERYTHING, with at least LEAST_FRAMES ``frames`` of ``height`` x ``width`` px, float32, B = 1.
+
+    Raises:
+        ValueError: another name, or too few frames.
+    """
     if name not in (*STREETS, EVERYTHING):
         raise ValueError(f"`name` must be one of {', '.join((*STREETS, EVERYTHING))}, got {name!r}")
     if frames < LEAST_FRAMES:

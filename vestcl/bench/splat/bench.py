@@ -73,7 +73,12 @@ class SplatBench(Options):
 
 
 def main(config: SplatBench) -> None:
-    """Measure, print and write."""
+    """Measure, print and write.
+
+    Raises:
+        ValueError: a size, radius or time that is not positive.
+        DeviceError: no such device.
+    """
     results.check_positive(config, "height", "width", "seconds", "threads")
     if not config.radii or min(config.radii) <= 0:
         raise ValueError(f"`radii` must be one or more positive numbers, got {config.radii}")
@@ -122,7 +127,15 @@ def _timed(
 def speed_rows(
     scene: Scene, seconds: float, threads: int, targets: tuple[float | None, float | None], prefix: str
 ) -> list[Measurement]:
-    """Time `splat` in turns with copies of its bytes; ``targets`` are of the ratios to them, forward and both."""
+    """Time `splat` in turns with copies of its bytes.
+
+    Args:
+        scene: what is splatted.
+        seconds: about how long to measure.
+        threads: of the copies.
+        targets: of the ratios to the copies, forward and both.
+        prefix: of the figures' names.
+    """
     facts = facts_of(scene)
     copies = {"copy": _timing.memcpy(threads, scene.features)}
     copies |= {"add": _timing.memcpy(threads, scene.features, torch.ones_like(scene.features))}

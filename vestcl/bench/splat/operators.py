@@ -89,7 +89,12 @@ class Operator:
 
 
 def main(config: OperatorsBench) -> None:
-    """Measure, print and write."""
+    """Measure, print and write.
+
+    Raises:
+        ValueError: a size or time that is not positive.
+        DeviceError: no such device.
+    """
     _results.check_positive(config, "height", "width", "channels", "radius", "seconds", "threads")
     _results.run("operators", config, partial(_sections, config), lambda seconds, _: seconds * _OPERATORS)
 
@@ -120,6 +125,12 @@ def measure(operator: Operator, seconds: float, threads: int, peer: bool = True)
 
     Bytes are read and written, every array once. The error is the largest of the results' distances to the reference's,
     relative, in the Euclidean norm.
+
+    Args:
+        operator: with its arguments.
+        seconds: about how long the turns take.
+        threads: of the copies.
+        peer: whether the reference is timed, and the error measured.
 
     Returns:
         A row for each of `PASSES`.

@@ -45,6 +45,14 @@ def roofline(scene: Scene, calls: int = CALLS, copy_bytes: int = COPY_BYTES) -> 
 
         share = max(bytes / bandwidth, flops / peak) / time
 
+    Args:
+        scene: what is splatted, float32.
+        calls: rounds of copy, multiply-adds and forward + backward.
+        copy_bytes: that the copy reads, and as many that it writes.
+
+    Raises:
+        ValueError: ``calls`` or ``copy_bytes`` not positive.
+
     Source: Williams, Waterman, Patterson: Roofline (2009).
     """
     if calls < 1 or copy_bytes < 1:

@@ -69,7 +69,15 @@ def both_passes(scene: Scene, image_of: Callable[[Scene], torch.Tensor] = Scene.
 
 
 def street(height: int, width: int, channels: int, radius: float, seed: int = 0) -> Scene:
-    """The scene of the benchmark: opacities are uniform in [0.6, 1), features and gradient normally distributed."""
+    """The scene of the benchmark: every number follows from the arguments.
+
+    Args:
+        height: rows of the image; there are height * width points.
+        width: columns of the image.
+        channels: of the features, drawn from a normal distribution, as is ``grad_image``.
+        radius: of all points, px.
+        seed: of the street and of everything drawn. Opacities are uniform in [0.6, 1).
+    """
     town = Street.generate(seed)
     camera = intrinsics(height, width)
     depth = town.render(np.linalg.inv(town.camera_pose(0.0)), camera, height, width).depth

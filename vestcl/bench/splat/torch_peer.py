@@ -120,7 +120,12 @@ def list_fragments(
 
 
 def splat(scene: Scene, expanding: Expand = expand) -> torch.Tensor:
-    """The image [1, C, H, W] of ``scene``, of one cloud, differentiable as `vestcl.splat`'s."""
+    """The image [1, C, H, W] of ``scene``, of one cloud, differentiable as `vestcl.splat`'s.
+
+    Args:
+        scene: of one cloud.
+        expanding: `expand`, or `compiled_expand`'s.
+    """
     arrays = (scene.points_uv, scene.z, scene.radii, scene.opacities, scene.features)
     size = (scene.height, scene.width)
     image: torch.Tensor = _TorchSplat.apply(*(array[0] for array in arrays), size, expanding)

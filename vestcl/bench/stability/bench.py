@@ -75,6 +75,10 @@ def main(config: StabilityBench) -> int:
 
     Returns:
         The exit status: 1 if a bound is broken, else 0.
+
+    Raises:
+        ValueError: an unknown family, or a number of threads that is not positive.
+        DeviceError: no such device, or none with float64 for the truth.
     """
     _results.check_positive(config, "threads")
     known = {family.name: family for family in FAMILIES}
@@ -186,6 +190,11 @@ def draw(family: Family, frame: pd.DataFrame, _: str) -> "Figure":
 def evaluate(case: Case, operators: Operators, dtype: torch.dtype) -> Outcome:
     """Run a case forward and backward.
 
+    Args:
+        case: whose inputs are rounded to ``dtype``.
+        operators: that compute.
+        dtype: float32 or float64.
+
     Returns:
         Outputs, and gradients of the sum of outputs times weights that are uniform in [-1, 1] and exact in float32.
     """
@@ -206,7 +215,12 @@ def evaluate(case: Case, operators: Operators, dtype: torch.dtype) -> Outcome:
 
 
 def bounds_of(case: Case, truth: Outcome) -> Errors:
-    """The largest errors of a case that roundings of float32 explain, array by array; ``truth`` is of float64."""
+    """The largest errors that roundings of float32 explain, array by array.
+
+    Args:
+        case: whose program ran.
+        truth: its outcome in float64.
+    """
     operators = noisy_operators(torch.Generator().manual_seed(case.seed))
     draws = [relative_errors(evaluate(case, operators, torch.float64), truth) for _ in range(_DRAWS)]
     return {
@@ -222,6 +236,10 @@ def relative_errors(got: Outcome, truth: Outcome) -> Errors:
 
 def relative_error(got: torch.Tensor, wanted: torch.Tensor) -> float:
     """max |got - wanted| / max |wanted| over a whole array: the maximum norm.
+
+    Args:
+        got: of any precision.
+        wanted: of the same shape.
 
     Returns:
         The error; 0 where both are equal, infinity where only ``wanted`` is 0 or ``got`` is not finite.

@@ -233,9 +233,16 @@ def _depths(count: int, nearest: float, farthest: float, generator: torch.Genera
 
 
 def clear_radii(points_uv: torch.Tensor, nominal: float, height: int, width: int) -> torch.Tensor:
-    """Radii [N] px whose circles about ``points_uv`` [N, 2] stay clear of the image's pixel centres.
+    """Radii near the ``nominal`` one whose circles stay clear of pixel centres.
 
-    Each is the middle of the widest gap between the centres' distances, in [0.85, 1.15] of ``nominal``.
+    Args:
+        points_uv: [N, 2] px.
+        nominal: px.
+        height: of the image, px.
+        width: of the image, px.
+
+    Returns:
+        [N] px: the middle of the widest gap between distances of centres, in [0.85, 1.15] of ``nominal``.
     """
     low, high = (factor * nominal for factor in _SLACK)
     reach = math.ceil(high) + 1

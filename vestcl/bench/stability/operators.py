@@ -169,7 +169,15 @@ class Layers:
 
 
 def list_layers(points_uv: torch.Tensor, z: torch.Tensor, radii: torch.Tensor, height: int, width: int) -> Layers:
-    """Every (point, pixel) with d2 < r^2 in the order (z, index): points_uv [N, 2] px, z [N] m, radii [N] px > 0."""
+    """Every (point, pixel) with d2 < r^2, composited in the order (z, index).
+
+    Args:
+        points_uv: [N, 2] px.
+        z: [N] m, none before the near plane.
+        radii: [N] px, positive.
+        height: of the image, px.
+        width: of the image, px.
+    """
     order = torch.sort(z.detach(), stable=True).indices
     nearest, x, y = fragments(points_uv.detach()[order], radii.detach()[order], height, width)
     pixels = y * width + x
