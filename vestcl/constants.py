@@ -48,14 +48,18 @@ HOST_POOL_BYTES: Final = 1 << 29
 #: image, so that in effect it only turns (SPEC section 3.5).
 SKY_DEPTH: Final = 10_000.0
 
-#: Frames are perceived and splatted at this width, px, where they are wider and nothing else is asked for;
-#: docs/performance.md has the figures.
-WORK_WIDTH: Final = 960
-
 #: Frames to forecast if neither steps nor seconds are given.
 DEFAULT_STEPS: Final = 5
 
-Quality = Literal["exact", "balanced", "fast"]
-"""Inference presets of a network (`vestcl.models.inference.quality`), best first."""
+Quality = Literal["exact", "balanced", "fast", "realtime"]
+"""Presets, best first: the width that scenes are perceived at, and how a network computes
+(`vestcl.models.inference.quality`)."""
 
 LEVELS: Final[tuple[Quality, ...]] = get_args(Quality)
+
+#: Wider frames are perceived and splatted at this width, px; None is their own. `vestcl bench front` measures the
+#: widths, docs/performance.md has the figures.
+WORK_WIDTHS: Final[dict[Quality, int | None]] = {"exact": None, "balanced": 960, "fast": 640, "realtime": 480}
+
+#: That of the default preset.
+WORK_WIDTH: Final = 960

@@ -113,7 +113,7 @@ def test_a_network() -> None:
         ({"fps": None}, "`fps` must be above 0 Hz, got None"),
         ({"steps": 1.5}, "`steps` must be 1 or more, a whole number, got 1.5"),
         ({"steps": "5"}, "`steps` must be 1 or more, a whole number, got '5'"),
-        ({"quality": "best"}, "`quality` must be one of exact, balanced, fast, got 'best'"),
+        ({"quality": "best"}, "`quality` must be one of exact, balanced, fast, realtime, got 'best'"),
         ({"model": 5}, "`model` must be None, a name, a file or a Forecaster, got 5"),
     ],
 )

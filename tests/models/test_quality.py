@@ -94,5 +94,5 @@ def test_what_files_contain() -> None:
 
 
 def test_refuses() -> None:
-    with pytest.raises(ValueError, match="`quality` must be one of exact, balanced, fast, got 'best'"):
+    with pytest.raises(ValueError, match="`quality` must be one of exact, balanced, fast, realtime, got 'best'"):
         quality.settings("best")  # type: ignore[arg-type]

@@ -154,8 +154,6 @@ def check_forecast(options: Forecast) -> None:
         raise ValueError("`perceive` is how a network sees its own forecast; it needs `model`")
     if options.learned is not None and options.model is None:
         raise ValueError("`learned` is which learned parts of a network count; it needs `model`")
-    if options.quality is not None and options.model is None:
-        raise ValueError("`quality` is how exactly a network computes; it needs `model`")
 
 
 def check_memory(steps: int, clip: "Clip", views: int) -> None:

@@ -9,7 +9,6 @@ from typing import Literal
 
 import tyro
 
-from vestcl.constants import WORK_WIDTH
 from vestcl.evaluation.st_lpips import Option as StLpipsOption
 
 
@@ -128,9 +127,9 @@ class Forecast(ClipOptions):
     perceive: Literal["splatted", "estimated"] | None = None
     """With mode feedback: depth and mask of forecast frames are splatted, or estimated by --depth-model and
     --mask-model. Default: estimated if one of these is given, else splatted."""
-    quality: Literal["exact", "balanced", "fast"] | None = None
-    """With --model, the inference preset: balanced (default) is within 0.1 dB of exact in PSNR, fast is not; see
-    docs/time_against_error."""
+    quality: Literal["exact", "balanced", "fast", "realtime"] | None = None
+    """Preset: the width that the scene is perceived at, if --work-width does not say, and with --model how the network
+    computes. Default: balanced. docs/performance.md has the time and the error of each."""
     learned: Literal["tested", "all"] | None = None
     """With --model, if it starts from measurements: correct the geometric forecast by those learned parts that would
     have improved it at the last frame (tested), or forecast by the network with all of them (all). Default: tested."""
@@ -154,9 +153,9 @@ class Forecast(ClipOptions):
     """Pixels. Default: the clip's, or in proportion to --width."""
     width: int | None = None
     """Pixels. Default: the clip's, or in proportion to --height."""
-    work_width: int = WORK_WIDTH
+    work_width: int | None = None
     """Perceive the scene at no more than this width in pixels, and show it at the size of the clip; 0: the clip's own
-    width. Smaller is faster."""
+    width. Smaller is faster. Default: by --quality, 960 of balanced."""
     memory: int | None = None
     """Geometric forecast only: frames before t-1 whose static scene fills what frames t and t-1 do not show; 0: none.
     Default: 3."""

@@ -17,7 +17,7 @@ from vestcl._version import __version__
 from vestcl.cli import checks, commands, horizon
 from vestcl.cli.clip import open_clip
 from vestcl.cli.progress import progress_bar
-from vestcl.cli.setup import Setup, load
+from vestcl.cli.setup import Setup, load, work_width
 from vestcl.data.open import clips_in
 from vestcl.data.street import input as street_input
 from vestcl.evaluation.compare import FORECAST, METRICS
@@ -136,6 +136,7 @@ def _request(options: commands.Forecast, drives: list[Drive]) -> dict[str, Any]:
         "view": list(options.view or ("source",)),
         "model": None if options.model is None else shipped.about_model(options.model),
         "quality": None if options.model is None else options.quality or quality.USUAL,
+        "work_width": work_width(options) or 0,
     }
 
 
@@ -178,7 +179,7 @@ def _forecast_drive(
     if not indices:
         return
     keep_decoded(drive)
-    perception = Perception(drive.clip, inpaint=setup.inpaint, work_width=options.work_width or None)
+    perception = Perception(drive.clip, inpaint=setup.inpaint, work_width=work_width(options))
     frames = DriveFrames(
         drive.clip,
         perception,

@@ -17,7 +17,7 @@ from vestcl import opencl
 from vestcl.cli import checks, commands, horizon
 from vestcl.cli.clip import open_clip
 from vestcl.cli.progress import ProgressBar, progress_bar
-from vestcl.cli.setup import Setup, load
+from vestcl.cli.setup import Setup, load, work_width
 from vestcl.clock import Clock
 from vestcl.constants import WORK_WIDTH
 from vestcl.data.sample import Clip
@@ -132,7 +132,8 @@ def _forecast(
     """By the network, or without one the geometric forecast."""
     stages.show("forecast", 0.0)
     asked = clip, index, steps, views
-    how: dict[str, Any] = {} if options.work_width == WORK_WIDTH else {"work_width": options.work_width or None}
+    width = work_width(options)
+    how: dict[str, Any] = {} if width == WORK_WIDTH else {"work_width": width}
     how |= {} if setup.inpaint is None else {"inpaint": setup.inpaint}
     model, later = setup.model, setup.later
     if model is None or later is None:

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from vestcl.cli import commands
 from vestcl.cli.clip import Estimators, load_estimators
+from vestcl.constants import WORK_WIDTHS
 from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.trunks.trunks import Trunk, load_trunk
 from vestcl.forecasting.network.later_frames import LaterFrames, later_frames
@@ -29,6 +30,13 @@ class Setup(NamedTuple):
     def by_geometry(self) -> "Setup":
         """The same without the network."""
         return self._replace(model=None, later=None)
+
+
+def work_width(options: commands.Forecast) -> int | None:
+    """Px, None is the clip's own: what --work-width says, else the preset's."""
+    if options.work_width is not None:
+        return options.work_width or None
+    return WORK_WIDTHS[options.quality or quality.USUAL]
 
 
 def load(options: commands.Forecast) -> Setup:

@@ -8,10 +8,10 @@ future.save("out")
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from vestcl import times
-from vestcl.constants import DEFAULT_STEPS, LEVELS, Quality
+from vestcl.constants import DEFAULT_STEPS, LEVELS, WORK_WIDTHS, Quality
 from vestcl.data.open import open_sequence
 from vestcl.data.sample import Clip
 from vestcl.data.street import input as street_input
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 #: Frames of a street if no number is given.
 STREET_FRAMES: Final = 12
+
+
+WorkWidth = int | Literal["preset"] | None
+"""Px, the largest width that scenes are perceived at; None is the clip's own."""
 
 
 def open(
@@ -93,9 +97,10 @@ def forecast(
             or `View`.
         model: None forecasts by geometry only; else a network: "vest-s", a file, a training checkpoint's folder, or a
             `Forecaster`.
-        quality: the inference preset of a network that is loaded here.
+        quality: the preset: the width that the scene is perceived at, and how a network that is loaded here computes.
         progress: called with the stage and the share of the work that is done.
-        **how: ``work_width`` (px, the largest width that scenes are perceived at; None is the clip's own), ``inpaint``
+        **how: ``work_width`` (px, the largest width that the scene is perceived at, in place of the preset's; None is
+            the clip's own), ``inpaint``
             and ``memory`` of `vestcl.forecasting.geometric.forecast_clip`, and ``mode``, ``perceive``, ``learned`` of
             `vestcl.forecasting.network.forecast.forecast_clip`.
 
@@ -176,6 +181,7 @@ def _made(
     how: dict[str, Any],
 ) -> Forecast:
     check_model(model, quality)
+    how = {"work_width": WORK_WIDTHS[quality], **how}
     if model is None:
         from vestcl.forecasting import geometric
 
@@ -189,6 +195,11 @@ def _loaded(model: "str | Path | Forecaster", quality: Quality) -> "Forecaster":
     from vestcl.models.inference import quality as presets
 
     return presets.load(model, quality) if isinstance(model, str | Path) else model
+
+
+def width_of(work_width: WorkWidth, quality: Quality) -> int | None:
+    """Px, None is the clip's own: ``work_width`` itself, or that of the preset."""
+    return WORK_WIDTHS.get(quality) if work_width == "preset" else work_width
 
 
 Make = Callable[[Perception, int, int, Sequence[View]], Forecast]

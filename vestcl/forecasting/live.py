@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vestcl.constants import WORK_WIDTH, Quality
+from vestcl.constants import Quality
 from vestcl.data import calibration
 from vestcl.data.sample import Clip, RightCamera, Sample, image_planes
 from vestcl.data.sources import ImageArray
-from vestcl.forecasting.api import check_steps, chosen_views, forecaster, open
+from vestcl.forecasting.api import WorkWidth, check_steps, chosen_views, forecaster, open, width_of
 from vestcl.forecasting.future import Future
 from vestcl.forecasting.result import View
 from vestcl.scene.flow.optical_flow import FLOW_SIDE
@@ -41,7 +41,7 @@ def live(
     model: "str | Path | Forecaster | None" = None,
     quality: Quality = "balanced",
     every: int = 1,
-    work_width: int | None = WORK_WIDTH,
+    work_width: WorkWidth = "preset",
     **options: Any,
 ) -> Iterator[Future]:
     """Forecast from each frame of a clip that has one before it, in order; later frames are not looked at.
@@ -53,7 +53,8 @@ def live(
         model: likewise.
         quality: likewise.
         every: from every how many-th frame.
-        work_width: see `vestcl.forecasting.geometric.forecast_clip`.
+        work_width: px, the largest width that scenes are perceived at; None is the clip's own, "preset" that of
+            ``quality``.
         **options: of `vestcl.open`, where ``clip`` is to be opened.
 
     Yields:
@@ -73,7 +74,7 @@ def live(
     if len(clip) < 2:
         raise ValueError(f"`clip` must have 2 frames or more, got {len(clip)}")
     cameras, make = chosen_views(views, clip, 1), forecaster(model, quality)
-    perception = Perception(clip, work_width=work_width)
+    perception = Perception(clip, work_width=width_of(work_width, quality))
     return (
         Future(clip, index, tuple(cameras), make(perception, index, steps, cameras))
         for index in range(1, len(clip), every)
@@ -95,7 +96,8 @@ class Live:
         quality: likewise.
         right_from_left: [4, 4] m, of a stereo rig; frames are then pushed with their right image.
         right_K: [3, 3] px, of the right camera; None is ``K``.
-        work_width: see `vestcl.forecasting.geometric.forecast_clip`.
+        work_width: px, the largest width that scenes are perceived at; None is the clip's own, "preset" that of
+            ``quality``.
 
     Raises:
         ValueError: matrices that are no camera or no rig, a rate that is not positive, no steps, or no such model.
@@ -112,15 +114,16 @@ class Live:
         quality: Quality = "balanced",
         right_from_left: ArrayLike | None = None,
         right_K: ArrayLike | None = None,
-        work_width: int | None = WORK_WIDTH,
+        work_width: WorkWidth = "preset",
     ) -> None:
         if not (is_real(fps) and 0 < fps < np.inf):
             raise ValueError(f"`fps` must be above 0 Hz, got {fps!r}")
         check_steps(steps)
-        check_work_width(work_width)
+        width = width_of(work_width, quality)
+        check_work_width(width)
         if right_K is not None and right_from_left is None:
             raise ValueError("`right_K` is of a stereo rig; it needs `right_from_left`")
-        self.K, self.fps, self.steps, self.work_width = _matrix("K", K), fps, steps, work_width
+        self.K, self.fps, self.steps, self.work_width = _matrix("K", K), fps, steps, width
         several = isinstance(views, Iterable) and not isinstance(views, str)
         self.views: str | tuple[str | View, ...] = tuple(views) if several else views  # type: ignore[assignment]
         self._rig = None if right_from_left is None else _matrix("right_from_left", right_from_left)

@@ -1,9 +1,9 @@
-"""Inference presets: three points on the speed-accuracy curve.
+"""Inference presets of a network: three points on the speed-accuracy curve.
 
     exact      float32; skips what changes nothing but rounding
     balanced   the knees that cost at most 0.1 dB of PSNR: what was measured as static is static, two blocks correct the
                motion of what does not, details are refined at half the size
-    fast       beyond them: details at a quarter of it, objects move as measured
+    fast       beyond them: details at a quarter of it, objects move as measured; realtime computes alike
 
 `vestcl bench pareto` measures the curve; docs/time_against_error has it, and the points chosen.
 """
@@ -19,8 +19,8 @@ from vestcl.models.inference.options import BALANCED, EXACT, FAST, InferenceOpti
 
 Quality = constants.Quality
 
-#: The levels, best first.
-LEVELS: Final = constants.LEVELS
+#: Those that differ in how a network computes, best first.
+LEVELS: Final[tuple[Quality, ...]] = ("exact", "balanced", "fast")
 
 #: Default of `vestcl forecast`: its loss of quality is not visible.
 USUAL: Final[Quality] = "balanced"
@@ -29,14 +29,19 @@ USUAL: Final[Quality] = "balanced"
 LOSS: Final[dict[Quality, float]] = {"exact": 0.0, "balanced": 0.1, "fast": 0.5}
 
 
-_PRESETS: Final[dict[Quality, InferenceOptions]] = {"exact": EXACT, "balanced": BALANCED, "fast": FAST}
+_PRESETS: Final[dict[Quality, InferenceOptions]] = {
+    "exact": EXACT,
+    "balanced": BALANCED,
+    "fast": FAST,
+    "realtime": FAST,
+}
 
 
 def settings(quality: Quality) -> InferenceOptions:
     """The preset of that name.
 
     Args:
-        quality: one of `LEVELS`.
+        quality: one of `vestcl.constants.LEVELS`.
 
     Returns:
         Options, as `Forecaster` has them.
@@ -44,8 +49,8 @@ def settings(quality: Quality) -> InferenceOptions:
     Raises:
         ValueError: another word.
     """
-    if quality not in LEVELS:
-        raise ValueError(f"`quality` must be one of {', '.join(LEVELS)}, got {quality!r}")
+    if quality not in _PRESETS:
+        raise ValueError(f"`quality` must be one of {', '.join(_PRESETS)}, got {quality!r}")
     return _PRESETS[quality]
 
 
