@@ -15,6 +15,7 @@ import torch
 from vestcl import opencl
 from vestcl.opencl import selection
 
+gc.disable()  # a third of the time that it takes to collect the tests; see pytest_collection_finish
 processes.preload()
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
@@ -32,9 +33,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What is there before the first test stays: neither benches nor tests that collect garbage need to look at it."""
+    """What is there before the first test stays: no collection of garbage needs to look at it, now or later."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 def _devices() -> list[opencl.DeviceInfo]:
