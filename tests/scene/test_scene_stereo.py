@@ -57,6 +57,21 @@ def test_without_filling_the_check_leaves_holes_where_only_one_camera_sees() -> 
     assert (depth > 0).mean() > 0.8
 
 
+@pytest.mark.parametrize("fill", [True, False])
+def test_only_disparities_that_half_the_size_shows_are_searched(fill: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    left, right, _ = pair()
+    create, searched = cv2.StereoSGBM.create, list[int]()
+
+    def recorded(**settings: Any) -> cv2.StereoSGBM:
+        searched.append(settings["numDisparities"])
+        return create(**settings)
+
+    monkeypatch.setattr(cv2.StereoSGBM, "create", recorded)
+    depth = stereo_depth(left, right, K, rig(), max_disparity=112, fill=fill)
+    assert searched == [64, 48]  # of 112 and half of it; the board has 20 px
+    np.testing.assert_allclose(np.median(depth[:, 34:66, 124:166]), 5, rtol=0.01)
+
+
 def test_far_is_a_limit() -> None:
     left, right, _ = pair()
     assert stereo_depth(left, right, K, rig(), far=10).max() == 10

@@ -31,6 +31,7 @@ from vestcl.forecasting.sheets import forecast_sheet
 from vestcl.forecasting.views import parse_views
 from vestcl.models import shipped
 from vestcl.models.inference import quality
+from vestcl.models.inference.processor import keep_freed_memory
 
 #: Steps in a table of scores, so that it fits 80 letters; forecast.json has all.
 STEPS_SHOWN: Final = 5
@@ -71,6 +72,7 @@ def run(options: commands.Forecast) -> None:
         DeviceError: no such OpenCL device.
     """
     checks.check_forecast(options)
+    keep_freed_memory()
     if options.every is None:
         _run_single(options)
         return

@@ -34,7 +34,7 @@ from vestcl.forecasting.views import check_name, seen_by
 from vestcl.io.atomic import read_bytes, remove_leftovers, write_bytes
 from vestcl.io.contact_sheet import Picture
 from vestcl.io.exr import ExrFrame, read_exr_frame, write_exr_frame
-from vestcl.io.images import read_image, to_pixels, write_image, write_pixels
+from vestcl.io.images import read_image, to_pixels, write_pixels
 from vestcl.io.video.writing import encoder_note, write_gif, write_mp4
 
 #: Raised when a reader of earlier files would misread newer ones.
@@ -226,7 +226,7 @@ def _write_frames(out: Path, forecast: Forecast, view: str, exr: bool) -> dict[s
     frames = []
     for step, rendered in enumerate(_of_view(forecast, view), start=1):
         files = {"image": f"{view}/{step:06}.png"}
-        write_image(out / files["image"], rendered.image)
+        write_pixels(out / files["image"], rendered.pixels)
         if exr:
             files["exr"] = f"{view}/{step:06}.exr"
             frame = ExrFrame(rendered.image, rendered.depth, rendered.coverage, rendered.motion_xyz)
@@ -242,9 +242,8 @@ def video_images(forecast: Forecast, clip: Clip, index: int, view: View) -> tupl
         How many frames come first, and all as [H, W, 3] uint8.
     """
     past = clip[max(0, index + 1 - CONTEXT) : index + 1] if isinstance(seen_by(view, clip[index]), Sample) else ()
-    context = [sample.read_image() for sample in past]
-    images = [*context, *(rendered.image for rendered in _of_view(forecast, view.name))]
-    return len(context), [to_pixels(image).astype(np.uint8, copy=False) for image in images]
+    context = [to_pixels(sample.read_image()).astype(np.uint8, copy=False) for sample in past]
+    return len(context), [*context, *(rendered.pixels for rendered in _of_view(forecast, view.name))]
 
 
 def _write_videos(

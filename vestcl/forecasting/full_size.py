@@ -69,20 +69,24 @@ def enlarged(image: Array, lookups: Sequence[Lookup], height: int, width: int) -
     Returns:
         [3, H, W] RGB in [0, 1]; D itself where a view shows just what was recorded.
     """
-    result = resize_image(image, height, width).copy()
+    result = resize_image(image, height, width)
+    result = result.copy() if result is image else result
     factors = width / image.shape[2], height / image.shape[1]
-    grid = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    axes = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
     for each in lookups:
         if not each.share.any():
             continue
         share = _up(each.share, height, width)
-        at = [
-            _up(plane, height, width) * np.float32(factor) + axis
-            for plane, factor, axis in zip(each.offset_uv, factors, grid, strict=True)
-        ]
+        at = [_up(plane, height, width) for plane in each.offset_uv]
+        for plane, factor, axis in zip(at, factors, axes, strict=True):
+            plane *= np.float32(factor)
+            plane += axis
         for plane, recorded, colour in zip(result, each.image, each.colour, strict=True):
-            there = cv2.remap(recorded, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            plane += share * (there - _up(colour, height, width))
+            mapped = cv2.remap(recorded, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            there = np.asarray(mapped, np.float32)
+            there -= _up(colour, height, width)
+            there *= share
+            plane += there
     return np.clip(result, 0, 1, out=result)
 
 

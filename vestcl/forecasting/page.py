@@ -161,22 +161,21 @@ def _seen(forecast: Forecast, clip: Clip, index: int, views: Sequence[View]) -> 
         label = "seen, t" if at == index else f"seen, t-{index - at}"
         cells = []
         for view in views:
-            camera = seen_by(view, clip[at])
-            shape = forecast.frames[0][view.name].image.shape
-            image = np.zeros(shape, np.float32) if camera is None or view.name != "source" else camera.read_image()
-            cells.append((view.name, image))
+            camera = seen_by(view, clip[at]) if view.name == "source" else None
+            size = forecast.frames[0][view.name].image.shape[1:]
+            cells.append((view.name, np.zeros((*size, 3), np.uint8) if camera is None else rgb(camera.read_image())))
         yield _stacked(cells, label, _SEEN)
 
 
 def _future(forecast: Forecast, views: Sequence[View]) -> Iterator[Picture]:
     for step, frame in enumerate(forecast.frames, start=1):
-        yield _stacked([(view.name, frame[view.name].image) for view in views], f"forecast, t+{step}", _FORECAST)
+        yield _stacked([(view.name, frame[view.name].pixels) for view in views], f"forecast, t+{step}", _FORECAST)
 
 
-def _stacked(images: Sequence[tuple[str, NDArray[np.float32]]], label: str, colour: tuple[int, int, int]) -> Picture:
+def _stacked(images: Sequence[tuple[str, Picture]], label: str, colour: tuple[int, int, int]) -> Picture:
     rows = []
     for name, image in images:
-        pixels = rgb(image).copy()
+        pixels = image.copy()
         pixels[:_BAR] = colour
         rows.append([Cell(pixels, f"{name}: {label}")])
-    return sheet(rows, cell_width=min(_WIDEST, max(image.shape[2] for _, image in images)))
+    return sheet(rows, cell_width=min(_WIDEST, max(image.shape[1] for _, image in images)))

@@ -1,13 +1,15 @@
 """What any forecast gives, whoever makes it: images of future frames from the cameras that were asked for."""
 
+import functools
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vestcl.data.resize import resize_image, resize_labels
+from vestcl.data.resize import resize_labels
 from vestcl.forecasting.full_size import Lookup, enlarged
+from vestcl.io.images import to_pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +44,17 @@ class Rendered:
     lookups: tuple[Lookup, ...] = ()
     """At a working size: where colours were recorded; see `at_size`."""
 
+    @functools.cached_property
+    def pixels(self) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB, ``image`` with 8 bit, as files show it.
+
+        Raises:
+            ValueError: NaN in the image.
+        """
+        return to_pixels(self.image).astype(np.uint8, copy=False)
+
     def at_size(self, height: int, width: int) -> "Rendered":
-        """The view at the clip's own size: colours of the recorded images, depth and motion of the nearest pixel.
+        """The view at the clip's own size: colours of the recorded images, all else of the nearest pixel.
 
         Args:
             height: px.
@@ -51,8 +62,8 @@ class Rendered:
         """
         if self.image.shape[1:] == (height, width):
             return self
-        coverage = resize_image(self.coverage, height, width)
-        depth, motion = (resize_labels(planes, height, width) for planes in (self.depth, self.motion_xyz))
+        planes = self.depth, self.coverage, self.motion_xyz
+        depth, coverage, motion = (resize_labels(each, height, width) for each in planes)
         return Rendered(enlarged(self.image, self.lookups, height, width), depth, coverage, motion)
 
 

@@ -2,8 +2,12 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
+from vestcl.data.resize import resize_labels
 from vestcl.forecasting.result import Rendered
-from vestcl.io.contact_sheet import DEPTH_COLOURS, FAR, NEAR, Cell, Picture, depth_map, grey, rgb, sheet
+from vestcl.io.contact_sheet import CELL_WIDTH, DEPTH_COLOURS, FAR, NEAR, Cell, Picture, depth_map, grey, sheet
 
 
 def forecast_sheet(frames: Sequence[Rendered], title: str = "") -> Picture:
@@ -21,11 +25,21 @@ def forecast_sheet(frames: Sequence[Rendered], title: str = "") -> Picture:
     """
     rows = [
         [
-            Cell(rgb(frame.image), f"t+{step}  forecast"),
-            Cell(depth_map(frame.depth), "depth (black: unknown)"),
-            Cell(grey(frame.coverage), f"coverage, mean {frame.coverage.mean():.1%} (black: disoccluded, inpainted)"),
+            Cell(frame.pixels, f"t+{step}  forecast"),
+            Cell(depth_map(_small(frame.depth)), "depth (black: unknown)"),
+            Cell(
+                grey(_small(frame.coverage)),
+                f"coverage, mean {frame.coverage.mean():.1%} (black: disoccluded, inpainted)",
+            ),
         ]
         for step, frame in enumerate(frames, start=1)
     ]
     scale = (f"depth, by its inverse: {FAR:g} m and more", f"{NEAR:g} m and less", DEPTH_COLOURS)
     return sheet(rows, title=title, bar=scale)
+
+
+def _small(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[1, H, W] no wider than a sheet shows it."""
+    height, width = plane.shape[1:]
+    smaller = min(1.0, CELL_WIDTH / width)
+    return resize_labels(plane, max(1, round(height * smaller)), round(width * smaller))

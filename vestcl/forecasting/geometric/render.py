@@ -71,32 +71,30 @@ def show(
         where: [1, H, W], True in requested pixels; None: all.
 
     Returns:
-        The composition; 0 where nothing is, and in pixels that are not requested.
+        The composition; 0 where nothing is, and in pixels that are not requested. Clouds behind an opaque pixel are
+        not looked at: they add nothing to its coverage either.
     """
     wanted = np.arange(height * width) if where is None else np.flatnonzero(where)
     planes, left = np.zeros((7, len(wanted)), np.float32), np.ones(len(wanted), np.float32)
-    uncovered, lookups = np.ones(len(wanted), np.float32), list[Lookup]()
+    lookups = list[Lookup]()
     for cloud in clouds:
-        through = left > 0
-        pixels = _Requested(
-            height, width, None if where is None else wanted, None if through.all() else wanted[through]
-        )
+        if not left.any():
+            break
+        through = np.s_[:] if (left > 0).all() else np.flatnonzero(left > 0)
+        everywhere = where is None and isinstance(through, slice)
+        pixels = _Requested(height, width, None if everywhere else wanted[through])
         mean, coverage, seen = _splat(cloud, K, tgt_from_next, pixels)
         opacity = np.minimum(coverage / np.float32(_OPAQUE), 1) * (coverage > HOLE)
+        share = left[through] * opacity
         if cloud.full is not None and where is None:
-            lookups.append(_lookup(cloud.full, seen, mean[:3], (left * opacity)[through], pixels))
-        if pixels.coloured is None:
-            mean *= left * opacity
-            planes += mean
-        else:
-            planes[:, through] += mean * (left * opacity)[through]
-        left *= 1 - opacity
-        uncovered *= 1 - coverage
+            lookups.append(_lookup(cloud.full, seen, mean[:3], share, pixels))
+        planes[:, through] += mean * share
+        left[through] *= 1 - opacity
     whole = np.maximum(1 - left, np.float32(1e-6))
     planes /= whole
     shares = [np.asarray(each.share / whole.reshape(height, width), np.float32) for each in lookups]
     lookups = [replace(each, share=share) for each, share in zip(lookups, shares, strict=True)]
-    both = np.concatenate([planes, 1 - uncovered[None]])
+    both = np.concatenate([planes, 1 - left[None]])
     if where is not None:
         some, both = both, np.zeros((8, height * width), np.float32)
         both[:, wanted] = some
@@ -110,14 +108,8 @@ class _Requested:
 
     height: int
     width: int
-    covered: NDArray[np.intp] | None
-    """[M], whose coverage is; None = of all."""
-    coloured: NDArray[np.intp] | None
-    """[L], those of them whose colour is, too; None = of the same."""
-
-    def of_view(self) -> NDArray[np.intp] | None:
-        """Pixels whose colour is requested; None = all."""
-        return self.covered if self.coloured is None else self.coloured
+    pixels: NDArray[np.intp] | None
+    """[L]; None = all."""
 
 
 def _lookup(
@@ -127,11 +119,11 @@ def _lookup(
     share: NDArray[np.float32],
     pixels: _Requested,
 ) -> Lookup:
-    """Of ``full`` [3, H', W'], by numbers [..., L] of the pixels whose colour is requested; 0 in the others."""
+    """Of ``full`` [3, H', W'], by numbers [..., L] of the requested ``pixels``; 0 in the others."""
     some = np.concatenate([seen, colour, share[None]])
-    if pixels.coloured is not None:
+    if pixels.pixels is not None:
         few, some = some, np.zeros((len(some), pixels.height * pixels.width), np.float32)
-        some[:, pixels.coloured] = few
+        some[:, pixels.pixels] = few
     planes = some.reshape(-1, pixels.height, pixels.width)
     return lookup(full, planes[:3], planes[3:6], planes[6])
 
@@ -139,13 +131,14 @@ def _lookup(
 def _splat(
     cloud: FrameCloud, K: NDArray[np.float64], tgt_from_next: NDArray[np.float64], wanted: _Requested
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """image [7, L], divided by coverage, coverage [M], and of `_seen_at` [3, L]."""
+    """image [7, L], divided by coverage, coverage [L], and of `_seen_at` [3, L]."""
     still = np.zeros((1, *cloud.points_xyz.shape), np.float32)
     points_uv, z = displace(
         cloud.points_xyz[None], still, K[None].astype(np.float32), tgt_from_next[None].astype(np.float32)
     )
-    if wanted.covered is not None:
-        kept = _near(cloud, points_uv[0], wanted.covered, wanted)
+    pixels = wanted.pixels
+    if pixels is not None:
+        kept = _near(cloud, points_uv[0], pixels, wanted)
         cloud, points_uv, z = _some(cloud, kept), points_uv[:, kept], z[:, kept]
     magnified = np.float32(1.0 if cloud.focal is None else K[0, 0] / cloud.focal)
     zoom, uv = magnified * cloud.z_src / np.maximum(z[0], np.float32(1e-3)), transposed(points_uv[0])
@@ -154,12 +147,14 @@ def _splat(
     opacities = (whole & (RHO * zoom <= RADIUS_LIMITS[1]))[None].astype(np.float32)
     size = wanted.height, wanted.width
     image, coverage = splat(points_uv, z, radii, opacities, _features(cloud, uv, z[0], zoom, whole)[None], *size)
-    composite, covered, pixels = image[0].transpose(1, 2, 0).reshape(-1, 16), coverage.ravel(), wanted.of_view()
-    mean = transposed(composite if pixels is None else composite[pixels])
-    mean /= np.maximum(covered if pixels is None else covered[pixels], np.float32(1e-6))
+    composite, covered = image[0].transpose(1, 2, 0).reshape(-1, 16), coverage.ravel()
+    if pixels is not None:
+        composite, covered = composite[pixels], covered[pixels]
+    mean = transposed(composite)
+    mean /= np.maximum(covered, np.float32(1e-6))
     seen = _seen_at(mean, pixels, *size)
     mean[:3] = _colour(mean, cloud.image, seen, wanted.width if pixels is None else _ROW)
-    return mean[:7], covered if wanted.covered is None else covered[wanted.covered], seen
+    return mean[:7], covered, seen
 
 
 def _features(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vestcl.models.config import Mode, ModelConfig
-from vestcl.models.forecaster import Perceive, perceive_estimated, perceive_forecast
+from vestcl.models.steps.perceive import Perceive, perceive_estimated, perceive_forecast
 from vestcl.scene.inpainting.inpainters import Inpainter
 
 Perceived = Literal["splatted", "estimated"]

@@ -6,17 +6,16 @@ frames, which all of them look at; what only losses need is dropped; encoder and
 and a process that keeps the memory that it frees is spared its page faults.
 """
 
-import ctypes
 import inspect
-import platform
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Final, Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch.nn import functional
 
 from vestcl.models.forecaster import Forecaster
+from vestcl.models.inference.processor import computes_bfloat16, keep_freed_memory
 from vestcl.models.networks.layers import tensors_in
 from vestcl.models.networks.object_motion import (
     MOTION_CHANNELS,
@@ -26,17 +25,9 @@ from vestcl.models.networks.object_motion import (
 )
 from vestcl.models.weights_file import unwrapped
 
-__all__ = ["FastForecaster", "Precision", "accelerate", "computes_bfloat16", "share_frames"]
+__all__ = ["FastForecaster", "Precision", "accelerate", "computes_bfloat16", "keep_freed_memory", "share_frames"]
 
 Precision = Literal["float32", "bfloat16"]
-
-#: Processors' names for their bfloat16 instructions, as `torch.cpu.get_capabilities` has them. Without any of these
-#: oneDNN computes in float32, and bfloat16 costs conversions on top.
-_BFLOAT16: Final = ("avx512_bf16", "amx_bf16", "avx_ne_convert", "bf16")
-
-#: Settings of glibc's mallopt: no separate memory maps for large blocks, nothing given back below 2 GiB; glibc's
-#: defaults.
-_MALLOPT: Final = {True: ((-4, 0), (-1, 2**31 - 1)), False: ((-4, 65536), (-1, 128 * 1024))}
 
 
 def accelerate(model: Forecaster, precision: Precision = "float32") -> "FastForecaster":
@@ -59,31 +50,6 @@ def accelerate(model: Forecaster, precision: Precision = "float32") -> "FastFore
     if isinstance(model, FastForecaster):
         raise ValueError(f"`model` must be a plain Forecaster, got {model.config.name} accelerated already")
     return FastForecaster(model, precision)
-
-
-def computes_bfloat16() -> bool:
-    """Whether this processor has instructions for bfloat16; False where torch does not report it."""
-    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    return any(capabilities.get(name, False) for name in _BFLOAT16)
-
-
-def keep_freed_memory(keep: bool = True) -> bool:
-    """Let this process keep what it frees, from now on: a forecast's large tensors come and go by the dozen.
-
-    glibc returns blocks of that size to the system, which then has to find, clear and map the pages of the next one.
-    The price is that the process stays as large as it has ever been.
-
-    Args:
-        keep: False returns to glibc's defaults.
-
-    Returns:
-        Whether that was done: with other C libraries than glibc nothing is changed.
-    """
-    if platform.libc_ver()[0] != "glibc":
-        return False
-    mallopt: Callable[[int, int], int] = ctypes.CDLL(None).mallopt
-    done = [mallopt(parameter, value) for parameter, value in _MALLOPT[keep]]
-    return all(done)
 
 
 class FastForecaster(Forecaster):

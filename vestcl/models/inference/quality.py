@@ -10,12 +10,15 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from vestcl import constants
-from vestcl.models.forecaster import Forecaster
-from vestcl.models.inference.fast import FastForecaster, accelerate, computes_bfloat16, keep_freed_memory
 from vestcl.models.inference.options import BALANCED, EXACT, FAST, InferenceOptions
+from vestcl.models.inference.processor import computes_bfloat16, keep_freed_memory
+
+if TYPE_CHECKING:  # a forecast without a network imports neither these nor what downloads them
+    from vestcl.models.forecaster import Forecaster
+    from vestcl.models.inference.fast import FastForecaster
 
 Quality = constants.Quality
 
@@ -63,7 +66,7 @@ def about(quality: Quality) -> dict[str, Any]:
     return {"quality": quality, **settings(quality).as_dict()}
 
 
-def apply(model: Forecaster, quality: Quality) -> Forecaster:
+def apply(model: "Forecaster", quality: Quality) -> "Forecaster":
     """Let ``model`` forecast at ``quality`` from now on; its weights stay as they are.
 
     bfloat16 is for processors that compute in it: elsewhere it costs time, and float32 stays. Where the network
@@ -86,7 +89,7 @@ def apply(model: Forecaster, quality: Quality) -> Forecaster:
     return model
 
 
-def load(name_or_path: str | Path, quality: Quality) -> FastForecaster:
+def load(name_or_path: str | Path, quality: Quality) -> "FastForecaster":
     """A trained network as commands use it: at ``quality``, laid out for inference; the process keeps what it frees.
 
     Args:
@@ -97,6 +100,9 @@ def load(name_or_path: str | Path, quality: Quality) -> FastForecaster:
         FileNotFoundError: no such file.
         ValueError: no such model, a damaged file, or another word.
     """
+    from vestcl.models.forecaster import Forecaster
+    from vestcl.models.inference.fast import accelerate
+
     keep_freed_memory()
     model = apply(Forecaster.from_pretrained(name_or_path), quality)
     return accelerate(model, "bfloat16" if model.options.autocast else "float32")

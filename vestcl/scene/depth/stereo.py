@@ -1,13 +1,14 @@
-"""Depth from a rectified stereo pair: semi-global matching, left-right check, and the WLS filter of opencv-contrib."""
+"""Depth from a rectified stereo pair: semi-global matching, left-right check, and a WLS filter."""
 
 import math
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vestcl.scene import checked
+from vestcl.scene.depth.completion import smooth
 
 #: Depths beyond are set to it: at 1242 pixels and a baseline of 0.54 m a disparity of 2 pixels, an error of 10 %.
 FAR: Final = 200.0
@@ -38,6 +39,9 @@ _PREFILTER: Final = 31
 #: Strength of the WLS filter and how much it minds edges of the image.
 _LAMBDA, _SIGMA_COLOUR = 2000.0, 1.2
 
+#: Keeps what is known of what the filter brings together above 0.
+_LEAST_SHARE: Final = 1e-4
+
 #: SGBM counts sixteenths of a pixel, and searches multiples of sixteen.
 _STEPS: Final = 16
 
@@ -59,16 +63,20 @@ def stereo_depth(
 ) -> NDArray[np.float32]:
     """z = fx b / d with d = u_left - u_right, the disparity, and b = -t_x, the baseline.
 
-    Disparities come from semi-global matching over all eight directions, sub-pixel, left to right and right to left.
-    The weighted least squares filter spreads those that agree over those that don't, up to the edges of the left
-    image, so what only the left camera sees takes the depth of its own side.
+    Disparities come from semi-global matching over all eight directions, sub-pixel, left to right; the right image's
+    for the left-right check come from the same costs. A weighted least squares filter, G(a d) / G(a) with a = 1 where
+    both agree, smooths them up to the edges of the left image. With ``fill`` the pair is also matched right to left,
+    which gives the filter a finer confidence: it spreads disparities that agree over those that don't, so what only the
+    left camera sees takes the depth of its own side. That match takes as long again, and gains nothing where only what
+    agrees is used: -0.06 dB at t+1 on 15 windows of KITTI odometry 00 and 06.
 
     Args:
         left: [3, H, W] RGB in [0, 1], rectified: no distortion, rows correspond. Full size is best.
         right: [3, H, W] likewise.
         K: [3, 3] px, of both.
         right_from_left: [4, 4] m, a shift along x only (1 mrad and 5 % of the baseline are tolerated); t_x < 0.
-        max_disparity: px, the largest that is searched, rounded up to a multiple of 16; None finds what is 3 m away.
+        max_disparity: px, the largest that is searched, rounded up to a multiple of 16; None finds what is 3 m away. At
+            full size only what a match at half the size finds is searched.
         far: m; greater depths are set to it.
         fill: whether pixels that fail the left-right check have a depth, from the filter.
 
@@ -89,7 +97,7 @@ def stereo_depth(
     if not far > 0:
         raise ValueError(f"`far` must be above 0 m, got {far}")
     searched = _searched(max_disparity, focal, left.shape[2])
-    disparity, agrees = _match(checked.pixels(left), checked.pixels(right), searched)
+    disparity, agrees = _match(checked.pixels(left), checked.pixels(right), searched, fill)
     disparity = _fill_rows(disparity, agrees)
     depth = (focal / disparity.clip(min=focal / far)).astype(np.float32)
     return np.where(agrees.any() if fill else agrees, depth, np.float32(0))[None]
@@ -112,11 +120,50 @@ def _searched(max_disparity: int | None, focal: float, width: int) -> int:
     return -(-wanted // _STEPS) * _STEPS
 
 
-def _match(left: NDArray[np.uint8], right: NDArray[np.uint8], searched: int) -> tuple[Disparity, NDArray[np.bool_]]:
-    """Filtered disparity [H, W] px, and where left and right agree. Columns are added on the left, where matching
-    has to look beyond the image."""
-    pair = [cv2.copyMakeBorder(side, 0, 0, searched, 0, cv2.BORDER_REPLICATE) for side in (left, right)]
-    matcher = cv2.StereoSGBM.create(
+def _match(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], searched: int, both_ways: bool
+) -> tuple[Disparity, NDArray[np.bool_]]:
+    """Filtered disparity [H, W] px, and where left and right agree; ``both_ways`` also matches from right to left."""
+    searched = _present(left, right, searched)
+    matcher, pair = _matcher(searched, _SPECKLE[0]), _padded(left, right, searched)
+    from_left = matcher.compute(*pair)
+    found = from_left[:, searched:]
+    agrees = found >= 0
+    if both_ways:
+        from_right = cv2.ximgproc.createRightMatcher(matcher).compute(*pair[::-1])
+        smoother = cv2.ximgproc.createDisparityWLSFilter(matcher)
+        smoother.setLambda(_LAMBDA)
+        smoother.setSigmaColor(_SIGMA_COLOUR)
+        filtered = smoother.filter(from_left, pair[0], disparity_map_right=from_right)[:, searched:]
+        return filtered.astype(np.float32) / np.float32(_STEPS), agrees
+    known = np.where(agrees, found, 0).astype(np.float32) / np.float32(_STEPS)
+    total, share = (smooth(left, each, _LAMBDA, _SIGMA_COLOUR) for each in (known, agrees.astype(np.float32)))
+    return np.where(agrees, total / np.maximum(share, np.float32(_LEAST_SHARE)), np.float32(0)), agrees
+
+
+def _present(left: NDArray[np.uint8], right: NDArray[np.uint8], searched: int) -> int:
+    """The largest disparity that a match at half the size finds and one step of the search more, at most ``searched``.
+
+    The time of matching goes with what is searched, and few images have something at 2 m.
+    """
+    half = -(-searched // (2 * _STEPS)) * _STEPS
+    height, width = left.shape[0] // 2, left.shape[1] // 2
+    if searched <= 2 * _STEPS or min(height, width) < _STEPS:
+        return searched
+    small = [cv2.resize(side, (width, height), interpolation=cv2.INTER_AREA) for side in (left, right)]
+    found = _matcher(half, _SPECKLE[0] // 4).compute(*_padded(small[0], small[1], half))[:, half:]
+    largest = 2 * float(found.max()) / _STEPS
+    return min(searched, -(-math.ceil(largest) // _STEPS) * _STEPS + _STEPS) if largest >= 0 else searched
+
+
+def _padded(left: Any, right: Any, searched: int) -> list[Any]:
+    """Both [H, W, 3] uint8 with columns added on the left, where matching has to look beyond the image."""
+    return [cv2.copyMakeBorder(side, 0, 0, searched, 0, cv2.BORDER_REPLICATE) for side in (left, right)]
+
+
+def _matcher(searched: int, speckle: int) -> cv2.StereoSGBM:
+    """``speckle``: connected regions of fewer pixels are dropped."""
+    return cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=searched,
         blockSize=_BLOCK,
@@ -125,18 +172,10 @@ def _match(left: NDArray[np.uint8], right: NDArray[np.uint8], searched: int) -> 
         disp12MaxDiff=_DIFFERENCE,
         preFilterCap=_PREFILTER,
         uniquenessRatio=_UNIQUENESS,
-        speckleWindowSize=_SPECKLE[0],
+        speckleWindowSize=speckle,
         speckleRange=_SPECKLE[1],
         mode=cv2.STEREO_SGBM_MODE_HH,
     )
-    from_left = matcher.compute(*pair)
-    from_right = cv2.ximgproc.createRightMatcher(matcher).compute(*pair[::-1])
-    smoother = cv2.ximgproc.createDisparityWLSFilter(matcher)
-    smoother.setLambda(_LAMBDA)
-    smoother.setSigmaColor(_SIGMA_COLOUR)
-    filtered = smoother.filter(from_left, pair[0], disparity_map_right=from_right)
-    here = np.s_[:, searched:]
-    return filtered[here].astype(np.float32) / np.float32(_STEPS), from_left[here] >= 0
 
 
 def _fill_rows(disparity: Disparity, agrees: NDArray[np.bool_]) -> Disparity:

@@ -45,10 +45,12 @@ def fill_holes(
         return image
     far = (inverse_depth + np.float32(_FAR)) ** -2 * np.float32(_FAR**2)
     planes = np.ascontiguousarray(np.where(hole, np.float32(0), image).transpose(1, 2, 0))
-    known = (np.where(hole[0], np.float32(0), weight) for weight in (far[0], np.ones_like(far[0])))
-    inside, outside = (_pull(planes, weight.astype(np.float32))[0] for weight in known)
-    at_border = _at_border(hole[0])
-    filled = np.where(at_border[..., None], outside, inside).transpose(2, 0, 1)
+    at_border, filled = _at_border(hole[0]), planes
+    for which, weight in ((hole[0] & ~at_border, far[0]), (at_border, np.ones_like(far[0]))):
+        if which.any():
+            pulled, _ = _pull(planes, np.where(hole[0], np.float32(0), weight).astype(np.float32))
+            filled = np.where(which[..., None], pulled, filled)
+    filled = filled.transpose(2, 0, 1)
     if vanishing_uv is not None:
         filled = carry_on(np.where(hole, filled, image), hole[0], at_border, vanishing_uv)
     return np.where(hole, filled, image)

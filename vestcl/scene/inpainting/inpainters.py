@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from skimage.restoration import inpaint_biharmonic
 from torch.nn import functional
 
 from vestcl.scene import checked
@@ -77,6 +76,7 @@ def frequency_selective(
 
 def biharmonic(colour: NDArray[np.float32], hole: NDArray[np.bool_], road: NDArray[np.bool_]) -> NDArray[np.float32]:
     """The biharmonic equation (Chui and Mhaskar, 2010), at a reduced size."""
+    from skimage.restoration import inpaint_biharmonic  # loads SciPy's sparse solvers
 
     def solve(small: NDArray[np.float32], gap: NDArray[np.bool_]) -> NDArray[np.float32]:
         filled = inpaint_biharmonic(small.transpose(1, 2, 0), gap, split_into_regions=True, channel_axis=-1)

@@ -19,7 +19,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import signal  # type: ignore[import-untyped]
 
 from vestcl.data.street.driving.course import GRAVITY, Course
 from vestcl.data.street.driving.profile import ROUGHNESS, TRACK, profile
@@ -292,6 +291,8 @@ def _stop(drive: RoadDrive, event: int) -> tuple[float, float]:
 @functools.lru_cache(maxsize=16)
 def _body_stretch(drive: RoadDrive, number: int) -> Array:
     """[BODY_STRETCH / BODY_TICK + 4, 3] pitch, roll and height; the first row is a tick before the stretch."""
+    from scipy import signal  # type: ignore[import-untyped]  # loads scipy.stats, which no other input needs
+
     start = number * BODY_STRETCH
     ticks = np.arange(-round(SETTLING / BODY_TICK) - 1, round(BODY_STRETCH / BODY_TICK) + 3)
     s, v, a = drive.state(start + ticks * BODY_TICK).T
