@@ -38,7 +38,7 @@ setup(
     packages=[*find_packages(include=["vestcl", "vestcl.*"]), "vestcl.kernels"],
     package_dir={"vestcl.kernels": "kernels"},
     package_data={
-        "vestcl": ["data/readers/*.json", "forecasting/*.html", "weights/*.safetensors"],
+        "vestcl": ["bench/stability/*.json", "data/readers/*.json", "forecasting/*.html", "weights/*.safetensors"],
         "vestcl.kernels": ["*.cl", "*.h", "*/*.cl", "*/*.h"],
     },
     install_requires=[

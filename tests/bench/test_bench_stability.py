@@ -14,6 +14,7 @@ import torch
 from vestcl import constants, opencl, reference
 from vestcl.bench.common import results as _results
 from vestcl.bench.stability import bench as stability
+from vestcl.bench.stability import measured
 from vestcl.bench.stability.bench import (
     Errors,
     StabilityBench,
@@ -109,6 +110,32 @@ def test_bounds_are_no_wider_than_a_thousand_errors(family: str) -> None:
         row = stability.measure_case(case, peers=False)
         for kind, errors in row["errors"].items():
             assert row["bounds"][kind][worst(errors)] < 1e3 * errors[worst(errors)]
+
+
+@pytest.mark.parametrize("case", cases("layers", "opacity", "angle"), ids=lambda case: case.name)
+def test_bounds_are_at_most_eight_times_what_was_measured(case: Case) -> None:
+    """On any device; an error below one rounding counts as one."""
+    kept = [device[case.name] for device in measured.read(measured.FILE).values()]
+    assert len(kept) >= 2
+    for kind, bounds in bounds_of(case, evaluate(case, OPERATORS, torch.float64)).items():
+        for name, bound in bounds.items():
+            assert bound <= 8 * max(UNIT, *(errors[kind][name] for errors in kept))
+
+
+def test_what_is_kept_only_falls(tmp_path: Path) -> None:
+    path = tmp_path / "measured.json"
+
+    def of(error: float) -> Errors:
+        return {"outputs": {"image": error, "coverage": 1e-7}}
+
+    measured.keep(path, "a", {"opacity 0": [of(1e-6), of(3e-6)], "opacity 1": [of(1.0)]})
+    measured.keep(path, "b", {"opacity 0": [of(5e-6)]})
+    measured.keep(path, "a", {"opacity 0": [of(4e-6)]})
+    assert measured.read(path)["a"]["opacity 0"]["outputs"] == {"image": 3e-6, "coverage": 1e-7}
+    measured.keep(path, "a", {"opacity 0": [of(2e-6)]})
+    assert measured.read(path)["a"]["opacity 0"]["outputs"]["image"] == 2e-6
+    assert measured.read(path)["a"]["opacity 1"]["outputs"]["image"] == 1.0
+    assert measured.read(path)["b"]["opacity 0"]["outputs"]["image"] == 5e-6
 
 
 @pytest.mark.parametrize("name", ["features", "opacities", "radii", "points_uv"])

@@ -10,6 +10,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import pandas as pd  # type: ignore[import-untyped]
@@ -22,6 +23,7 @@ from vestcl.bench.common.estimate import announced
 from vestcl.bench.common.options import Options
 from vestcl.bench.common.plots import Curve, curves
 from vestcl.bench.common.table import Measurement, Section
+from vestcl.bench.stability import measured
 from vestcl.bench.stability.cases import FAMILIES, Case, Family, Inputs
 from vestcl.bench.stability.operators import OPERATORS, Operators, noisy_operators, peers_of
 
@@ -68,6 +70,9 @@ class StabilityBench(Options):
     """Compare with backwards that divide by 1 - alpha, and with a flow that subtracts, too."""
     seed: int = 0
     """Of all random numbers."""
+    keep: Path | None = None
+    """File for the largest errors of five seeds on each device: bounds follow from
+    vestcl/bench/stability/measured.json."""
 
 
 def main(config: StabilityBench) -> int:
@@ -87,7 +92,7 @@ def main(config: StabilityBench) -> int:
             raise ValueError(f"`families` must be of {', '.join(known)}, got {name}")
     broken = dict[str, list[str]]()
 
-    def measure(_: opencl.Session, console: Console) -> Iterator[Section]:
+    def measure(session: opencl.Session, console: Console) -> Iterator[Section]:
         families = [known[name] for name in config.families] or list(FAMILIES)
         for family in announced(families, console, "families of inputs"):
             with console.status(family.name):
@@ -100,6 +105,10 @@ def main(config: StabilityBench) -> int:
                 *(_ABOUT[name] for name in dict.fromkeys(name for row in rows.values() for name in row["peers"])),
             )
             yield Section(title, cells, notes, {family.name: partial(draw, family)})
+        if config.keep is not None:
+            with console.status(f"errors of {len(measured.SEEDS)} seeds"):
+                name = f"{session.info.name}, {session.info.platform}"
+                measured.keep(config.keep, name, _errors_by_seed(families))
 
     _results.run("stability", config, measure)
     console = _results.console()
@@ -124,6 +133,17 @@ def measure_case(case: Case, peers: bool = True) -> Row:
     # The background that "clamping" lets through is not a matter of precision.
     others.get("clamping", {"gradients": {}})["gradients"].pop("backgrounds", None)
     return {"broken": broken_bounds(errors, bounds), "errors": errors, "bounds": bounds, "peers": others}
+
+
+def _errors_by_seed(families: list[Family]) -> dict[str, list[Errors]]:
+    """By case, the errors for each of `measured.SEEDS` on the current device."""
+    found: dict[str, list[Errors]] = {}
+    for case in (case for family in families for seed in measured.SEEDS for case in family.cases(seed, quick=False)):
+        with _float64():
+            truth = evaluate(case, OPERATORS, torch.float64)
+        errors = relative_errors(evaluate(case, OPERATORS, torch.float32), truth)
+        found.setdefault(case.name, []).append(errors)
+    return found
 
 
 def broken_bounds(errors: Errors, bounds: Errors) -> list[str]:
@@ -215,7 +235,7 @@ def evaluate(case: Case, operators: Operators, dtype: torch.dtype) -> Outcome:
 
 
 def bounds_of(case: Case, truth: Outcome) -> Errors:
-    """The largest errors that roundings of float32 explain, array by array.
+    """The largest errors that roundings of float32 explain, array by array, and no more than `measured` allows.
 
     Args:
         case: whose program ran.
@@ -223,10 +243,11 @@ def bounds_of(case: Case, truth: Outcome) -> Errors:
     """
     operators = noisy_operators(torch.Generator().manual_seed(case.seed))
     draws = [relative_errors(evaluate(case, operators, torch.float64), truth) for _ in range(_DRAWS)]
-    return {
+    rounding = {
         kind: {name: _SAFETY * max(draw[kind][name] for draw in draws) for name in arrays}
         for kind, arrays in truth.items()
     }
+    return measured.tightened(case.name, rounding)
 
 
 def relative_errors(got: Outcome, truth: Outcome) -> Errors:
