@@ -1,6 +1,7 @@
 """Rows of the tables on the camera's forecast, on inpainting and on the networks' time: the heading first."""
 
 import math
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
@@ -8,6 +9,9 @@ from rows import CLIPS, Row, tables_of
 
 #: Errors of a camera's forecast, and their digits.
 CAMERA_ERRORS: Final = (("rotation_deg", ".3f"), ("translation_percent", ".2f"))
+
+#: Metrics of the whole chain, and their digits.
+CHAIN: Final = {"psnr": ".2f", "ms_ssim": ".3f", "st_lpips": ".3f"}
 
 #: What inpainters are called; others have their own name.
 INPAINTERS: Final = {
@@ -114,3 +118,24 @@ def forecast_times(content: Mapping[str, Any]) -> Iterator[Row]:
         cells = (found.get((name, width)) for width in widths)
         label = CLIPS.get(str(name), str(name))
         yield (label, *("-" if row is None else f"{row['cpu_s']:.0f} s, {row['memory_gb']:.1f} GB" for row in cells))
+
+
+def front(content: Mapping[str, Any]) -> Iterator[Row]:
+    """A row per method, of `vestcl bench front`: medians of the time over all windows, and means of the scores over
+    clips."""
+    records = content["records"]
+    yield ("from a new frame to its forecast", "CPU, s", "PSNR, t+1", "PSNR", "MS-SSIM", "ST-LPIPS")
+    for method in dict.fromkeys(each["method"] for each in records):
+        own = [each for each in records if each["method"] == method]
+        first, *others = _over_clips(own, "psnr", slice(1)), *(_over_clips(own, name) for name in CHAIN)
+        cpu = statistics.median(each["cpu_s"] for each in own)
+        scores = (f"{value:{digits}}" for value, digits in zip(others, CHAIN.values(), strict=True))
+        yield (method, f"{cpu:.2f}", f"{first:.2f}", *scores)
+
+
+def _over_clips(records: Sequence[Mapping[str, Any]], metric: str, steps: slice = slice(None)) -> float:
+    """The mean over clips of their mean over windows and ``steps``."""
+    by_clip: dict[str, list[float]] = {}
+    for each in records:
+        by_clip.setdefault(each["clip"], []).extend(each[metric][steps])
+    return _mean([_mean(values) for values in by_clip.values()])

@@ -1,6 +1,6 @@
 """CPU time and memory of `vestcl forecast`, the whole command with its files: the table of docs/performance.md.
 
-    python docs/forecast_times.py --out times.json --work-width 0 960 CLIP ...
+    python docs/forecast_times.py CLIP ... --out times.json --work-width 0 960
     python docs/tables.py --keep times.json forecast_times
 
 Each command runs in a process of its own, --runs times in turns; the least CPU time counts, for other work on the

@@ -158,6 +158,15 @@ def ablation(content: Mapping[str, Any]) -> Iterator[Row]:
         yield (label, *cells)
 
 
+def evaluated(content: Mapping[str, Any]) -> Iterator[Row]:
+    """A row per camera and method, of `train.evaluate`."""
+    yield ("PSNR / MS-SSIM / ST-LPIPS", "method", *(f"t+{k}" for k in STEPS))
+    for view in ("source", "right"):
+        for number, (method, of) in enumerate(content["summary"][view].items()):
+            first = "" if number else f"{view}; {of['windows']} windows"
+            yield (first, METHODS.get(method, method), *(_scores(of, tuple(METRICS), k) for k in STEPS))
+
+
 def presets(content: Mapping[str, Any]) -> Iterator[Row]:
     """A row per inference preset, of `vestcl bench pareto`."""
     yield ("preset", "ms/step", "delta PSNR at t+1 against `exact`, dB", "MS-SSIM", "settings")

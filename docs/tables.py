@@ -100,6 +100,9 @@ ABLATION: Final = Source(
     "docs/results/ablation.json",
     "python -m train.evaluate street --height 128 --width 416 --seeds 1100 1119 --st-lpips FILE",
 )
+PEER: Final = Source(
+    "docs/results/peer_streets.json", "python -m train.evaluate street --model vest-s --peer FILE --st-lpips FILE"
+)
 SPLAT: Final = Source("docs/results/splat.json", "vestcl bench splat")
 STABILITY: Final = Source("docs/results/stability.json", "vestcl bench stability")
 CAMERA: Final = Source("docs/results/camera.json", "vestcl bench camera 00.txt 06.txt")
@@ -112,8 +115,9 @@ NETWORK_PAPER: Final = Source(
     "docs/results/network_paper.json", "vestcl bench network --model vest-paper+colour --runs 2 --no-training"
 )
 TRAIN_STEP: Final = Source("docs/results/train_step.json", "vestcl bench train-step")
+FRONT: Final = Source("docs/results/front.json", "vestcl bench front CLIP ... --windows 1 --st-lpips FILE")
 FORECAST_TIMES: Final = Source(
-    "docs/results/forecast_times.json", "python docs/forecast_times.py --work-width 0 960 640 CLIP ..."
+    "docs/results/forecast_times.json", "python docs/forecast_times.py CLIP ... --work-width 0 960 640 --runs 1"
 )
 PARETO: Final = Source("docs/time_against_error/pareto.json", "vestcl bench pareto")
 PIPELINE: Final = Source("docs/time_against_error/pipeline.json", "vestcl bench pipeline")
@@ -126,6 +130,7 @@ TABLES: Final = {
     "streets-source": Table((STREETS,), rows.methods("source")),
     "streets-right": Table((STREETS,), rows.methods("right")),
     "streets-facts": Table((STREETS,), rows.facts),
+    "peer-streets": Table((PEER,), rows.evaluated),
     "ablation": Table((ABLATION,), rows.ablation),
     "speed": Table((PARETO,), rows.speed),
     "presets": Table((PARETO,), rows.presets),
@@ -133,6 +138,7 @@ TABLES: Final = {
     "inpainting": Table((INPAINTING,), bench_rows.inpainting),
     "memory": Table((MEMORY,), bench_rows.memory),
     "network": Table((NETWORK, NETWORK_PAPER), bench_rows.network),
+    "front": Table((FRONT,), bench_rows.front),
     "forecast-times": Table((FORECAST_TIMES,), bench_rows.forecast_times),
     "train-step": Table((TRAIN_STEP,), bench_rows.training),
     "splat": Table((SPLAT,), rows.splatting),

@@ -252,3 +252,13 @@ def test_times_of_commands() -> None:
     heading, *found = bench_rows.forecast_times({"rows": [dict(zip(keys, each, strict=True)) for each in measured]})
     assert heading == ("CPU time, memory", "own width", "960 px")
     assert found == [("a.mp4", "20 s, 1.3 GB", "10 s, 1.0 GB"), ("b", "-", "5 s, 1.0 GB")]
+
+
+def test_the_front_is_of_means_over_clips() -> None:
+    def record(clip: str, cpu_s: float, *psnr: float) -> dict[str, Any]:
+        more = {"ms_ssim": [0.9], "st_lpips": [0.1]}
+        return {"clip": clip, "method": "geometric, 640 px", "cpu_s": cpu_s, "psnr": list(psnr), **more}
+
+    records = [record("a", 1, 20, 10), record("a", 2, 24, 14), record("b", 9, 30, 20)]
+    _, row = bench_rows.front({"records": records})
+    assert row == ("geometric, 640 px", "2.00", "26.00", "21.00", "0.900", "0.100")

@@ -32,7 +32,7 @@ from vestcl.forecasting.result import View
 _BEFORE: Final = 5
 
 #: What rows of the geometric forecast are called.
-_GEOMETRIC, _OWN = "geometric", "own width"
+_GEOMETRIC, _OWN, _REPEAT = "geometric", "own width", "repeat"
 
 Images = list[np.ndarray[Any, np.dtype[np.float32]]]
 
@@ -109,7 +109,8 @@ def _tasks(text: str, config: FrontBench) -> Iterator[_Task]:
     if last < _BEFORE:
         raise ValueError(f"{text}: must have {_BEFORE + config.steps + 1} frames or more, got {len(clip)}")
     methods = _methods(config, clip)
-    for index in sorted({round(index) for index in np.linspace(_BEFORE, last, config.windows)}):
+    middles = (np.arange(config.windows) + 0.5) / config.windows
+    for index in sorted({round(_BEFORE + share * (last - _BEFORE)) for share in middles}):
         yield from (_Task(text, clip, index, name, make) for name, make in methods.items())
 
 
@@ -141,7 +142,7 @@ def _methods(config: FrontBench, clip: Clip) -> dict[str, Method]:
 
     widths = {f"{_GEOMETRIC}, {f'{width} px' if width else _OWN}": chain(width) for width in config.work_widths}
     networks = {f"{model}, {level}": chain(WORK_WIDTH, model, level) for model in config.model for level in LEVELS}
-    flat = {"optical flow": baselines.flow_extrapolation, "repeat": baselines.repeat_last}
+    flat = {"optical flow": baselines.flow_extrapolation, _REPEAT: baselines.repeat_last}
     return widths | networks | {name: baseline(make) for name, make in flat.items()}
 
 
@@ -195,8 +196,8 @@ def _rows(found: pd.DataFrame) -> Iterator[Measurement]:
 
 
 def figure(frame: pd.DataFrame) -> Any:
-    """Seconds against each metric, means over steps and clips."""
-    found, panels = means(frame), dict[str, list[plots.Curve]]()
+    """Seconds against each metric, means over steps and clips; repeating takes no time, and is left out."""
+    found, panels = means(frame).drop(index=_REPEAT, errors="ignore"), dict[str, list[plots.Curve]]()
     for metric, label in {"psnr": "PSNR, dB", "ms_ssim": "MS-SSIM", "st_lpips": "ST-LPIPS"}.items():
         if not np.isfinite(found[metric]).all():
             continue
