@@ -57,9 +57,9 @@ Quality = Literal["exact", "balanced", "fast", "realtime"]
 
 LEVELS: Final[tuple[Quality, ...]] = get_args(Quality)
 
-#: Wider frames are perceived and splatted at this width, px; None is their own. `vestcl bench front` measures the
-#: widths, docs/performance.md has the figures.
-WORK_WIDTHS: Final[dict[Quality, int | None]] = {"exact": None, "balanced": 960, "fast": 640, "realtime": 480}
-
-#: That of the default preset.
+#: Wider frames are perceived and splatted at this width by default, px.
 WORK_WIDTH: Final = 960
+
+#: The same by preset; None is their own width. `vestcl bench front` measures the widths, docs/performance.md has the
+#: figures.
+WORK_WIDTHS: Final[dict[Quality, int | None]] = {"exact": None, "balanced": WORK_WIDTH, "fast": 640, "realtime": 480}

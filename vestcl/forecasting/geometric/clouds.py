@@ -78,9 +78,8 @@ def _refuted(
 ) -> NDArray[np.bool_]:
     """[1, H, W], True where a point would hide what the current frame, of ``depth_cur``, shows: it can't be there."""
     rays = rays_of(K, *depth.shape[1:])
-    u, v, z = (
-        linear(K @ cur_from_src[:3, :3], rays * depth + elapsed * velocity) + (K @ cur_from_src[:3, 3:])[..., None]
-    )
+    points, shift = rays * depth + elapsed * velocity, K @ cur_from_src[:3, 3]
+    u, v, z = linear(K @ cur_from_src[:3, :3], points) + shift[:, None, None]
     ahead = np.maximum(z, _NEAREST)
     seen = nearest(depth_cur, np.where(z > _NEAREST, u / ahead - 0.5, np.nan), v / ahead - 0.5)
     return np.asarray(_IN_FRONT * z < seen)
