@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from vestcl.cli import commands
 from vestcl.cli.clip import Estimators, load_estimators
-from vestcl.constants import WORK_WIDTHS
 from vestcl.evaluation.perceptual import StLpips
 from vestcl.evaluation.trunks.trunks import Trunk, load_trunk
+from vestcl.forecasting.api import WorkWidth, width_of
 from vestcl.forecasting.network.later_frames import LaterFrames, later_frames
 from vestcl.models.inference import quality
 from vestcl.scene.inpainting.inpainters import Inpainter, inpainter
@@ -34,9 +34,8 @@ class Setup(NamedTuple):
 
 def work_width(options: commands.Forecast) -> int | None:
     """Px, None is the clip's own: what --work-width says, else the preset's."""
-    if options.work_width is not None:
-        return options.work_width or None
-    return WORK_WIDTHS[options.quality or quality.USUAL]
+    asked: WorkWidth = "preset" if options.work_width is None else options.work_width or None
+    return width_of(asked, options.quality or quality.USUAL)
 
 
 def load(options: commands.Forecast) -> Setup:

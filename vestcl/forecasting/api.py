@@ -181,7 +181,7 @@ def _made(
     how: dict[str, Any],
 ) -> Forecast:
     check_model(model, quality)
-    how = {"work_width": WORK_WIDTHS[quality], **how}
+    how = {"work_width": width_of("preset", quality), **how}
     if model is None:
         from vestcl.forecasting import geometric
 
